@@ -131,7 +131,8 @@ def _median_of_windows(windows: Floats) -> Floats:
 def _find_corrupt_rows(distance: Floats) -> Ints:
     """Return the indices of the corrupt rows. ``distance`` is relative to the limit of the axis."""
     n = distance.size
-    order = np.argsort(distance)[::-1][: MAX_ROWS + 1]
+    largest = np.argpartition(distance, max(n - MAX_ROWS - 1, 0))[max(n - MAX_ROWS - 1, 0) :]
+    order = largest[np.argsort(distance[largest])[::-1]]
     for count in range(min(MAX_ROWS, order.size - 1), 0, -1):
         rows, least = order[:count], distance[order[count - 1]]
         at_end = bool(((rows < END_ROWS) | (rows >= n - END_ROWS)).all())

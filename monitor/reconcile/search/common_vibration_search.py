@@ -84,13 +84,10 @@ class CrossSpectra:
     def gain_nats(self, unit: Floats, gains: Floats) -> float:
         """Return the log-likelihood gain of a vibration with the unit variance [m] and the gains [d]."""
         scaled = np.clip(gains[:, None] * np.sqrt(unit) / self.deviation, -1.0, 1.0)
-        total = 0.0
-        for x, y in zip(*np.triu_indices(gains.size, 1), strict=True):
-            if gains[x] and gains[y] and self.used[x, y]:
-                known, products = self.known[x, y], self.products[x, y]
-                total += correlation_gain(_limited(known + scaled[x] * scaled[y]), products, self.bins.count)
-                total -= correlation_gain(known, products, self.bins.count)
-        return total
+        x, y = np.nonzero(np.triu(self.used * np.outer(gains, gains), 1))
+        known, products, count = self.known[x, y], self.products[x, y], self.bins.count
+        whole = correlation_gain(_limited(known + scaled[x] * scaled[y]), products, count)
+        return whole - correlation_gain(known, products, count) if known.any() else whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +109,9 @@ def correlation_gain(correlation: Floats, products: Floats, count: Floats) -> fl
 
     Parameters
     ----------
-    correlation : ndarray of float64, shape (m,)
-        Correlation in each frequency bin.
-    products : ndarray of float64, shape (m,)
+    correlation : ndarray of float64, shape (m,) or (p, m)
+        Correlation in each frequency bin. The gains of p pairs of axes are added.
+    products : ndarray of float64, shape (m,) or (p, m)
         Sum of the products of the coefficients of both axes in each bin.
     count : ndarray of float64, shape (m,)
         Number of coefficients in each bin.

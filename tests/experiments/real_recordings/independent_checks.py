@@ -252,8 +252,8 @@ def _check_variance_period(recording: CheckedRecording, axis: str, p: Parameters
 
 
 def _check_variance_correlation(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
-    blocks = int(min(recording.values[axis].size // 32, 3.0 * recording.duration_s / p["correlation_time"]))
-    logs = _block_log_deviation(recording, axis, max(blocks, 16))
+    wanted = max(200, int(12.0 * recording.duration_s / p["correlation_time"]))
+    logs = _block_log_deviation(recording, axis, max(16, min(recording.values[axis].size // 32, wanted)))
     logs = np.clip(logs, *np.quantile(logs, [0.02, 0.98]))
     logs = logs - logs.mean()
     correlation = float(logs[1:] @ logs[:-1] / (logs @ logs))
