@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from monitor.noise.effects import WanderingVariance
 from tests.experiments.real_recordings.independent_checks import CheckedRecording, check_effect
 
 RATE_HZ, DEVIATION_HZ = 100.0, 1.0
@@ -22,3 +23,14 @@ def test_wandering_line_is_confirmed_by_the_power_within_its_frequency_deviation
     parameters = {"frequency": 20.0, "frequency_deviation": DEVIATION_HZ}
     check = check_effect(draw_recording(amplitude), "gx", "wandering_line", parameters)
     assert check.confirmed == (amplitude > 0.0)
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.4])
+@pytest.mark.parametrize("correlation_time", [2.0, 100.0])
+def test_wandering_variance_is_confirmed_by_the_correlation_of_adjacent_blocks(deviation, correlation_time):
+    rng = np.random.default_rng(4)
+    effect = WanderingVariance(deviation=deviation, correlation_time=correlation_time)
+    gain = effect.start_gain(RATE_HZ, rng).compute_gain(0, n)
+    recording = CheckedRecording({"gx": gain * rng.standard_normal(n)}, RATE_HZ, None)
+    check = check_effect(recording, "gx", "wandering_variance", {"correlation_time": correlation_time})
+    assert check.confirmed == (deviation > 0.0)
