@@ -14,6 +14,7 @@ beside ``monitor`` by its path.
 """
 
 import contextlib
+import gc
 import importlib
 import io
 import os
@@ -80,6 +81,8 @@ REQUIRED: Final = {"monitor": "cli/__init__.py", "drivers": "errors.py", "config
 """A file of each folder that a foreign folder of that name does not have."""
 DEBUG: Final = "--debug"
 FAILED: Final = 1
+GARBAGE_THRESHOLD: Final = 20_000
+"""Number of new objects between two searches for garbage. Imports create many objects that are no garbage."""
 
 
 class OwnPackages(MetaPathFinder):
@@ -141,6 +144,7 @@ def open_standard_streams() -> None:
 def main() -> None:
     """Run the program; it ends with ``SystemExit``."""
     open_standard_streams()
+    gc.set_threshold(GARBAGE_THRESHOLD)
     debug = DEBUG in sys.argv[1:]
     if not debug:
         warnings.simplefilter("ignore")  # they are for developers; the environment may even make errors of them
