@@ -252,14 +252,18 @@ def _check_variance_period(recording: CheckedRecording, axis: str, p: Parameters
 
 
 def _check_variance_correlation(recording: CheckedRecording, axis: str, p: Parameters) -> Check:
+    difference = np.abs(np.diff(recording.values[axis]))
     wanted = max(200, int(12.0 * recording.duration_s / p["correlation_time"]))
-    logs = _block_log_deviation(recording, axis, max(16, min(recording.values[axis].size // 32, wanted)))
-    logs = np.clip(logs, *np.quantile(logs, [0.02, 0.98]))
+    blocks = max(16, min(difference.size // 32, wanted))
+    size = difference.size // blocks
+    logs = np.log(difference[: size * blocks].reshape(blocks, size).mean(axis=1) + 1e-300)
+    logs = np.clip(logs, *np.quantile(logs, [0.05, 0.95]))  # single knocks
     logs = logs - logs.mean()
-    correlation = float(logs[1:] @ logs[:-1] / (logs @ logs))
+    lags = range(1, int(np.clip(0.5 * p["correlation_time"] * blocks / recording.duration_s, 1, blocks // 8)) + 1)
+    correlations = [float(logs[lag:] @ logs[:-lag] / (logs @ logs)) for lag in lags]
+    z = float(np.sum(correlations)) * (blocks / len(lags)) ** 0.5
     return Check(
-        correlation * logs.size**0.5 > MIN_Z,
-        f"correlation {correlation:.2f} of the noise of {logs.size} adjacent blocks",
+        z > MIN_Z, f"mean correlation {np.mean(correlations):.2f} of the noise of {blocks} blocks, z = {z:.1f}"
     )
 
 
