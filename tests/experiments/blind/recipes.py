@@ -252,6 +252,8 @@ def scaled(effect: Effect, world: World, factor: float) -> Effect:
         value = value**factor
     elif parameter == "cutoff":
         value = max(0.5 * world.rate_hz - factor * (0.5 * world.rate_hz - value), 0.02 * world.rate_hz)
+    elif parameter == "nu":  # fewer degrees of freedom are heavier tails
+        value = value / factor
     elif parameter == "limit":
         noise, bias = world.noise(effect.axis), abs(world.bias[effect.axis])
         value = bias - float(ndtri(factor * ndtr((bias - value) / noise))) * noise

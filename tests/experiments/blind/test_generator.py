@@ -7,7 +7,7 @@ import pytest
 
 from tests.experiments.blind import cases, foreign, levels, oracle, processes, sensors, spectra
 from tests.experiments.blind.processes import Clock, generator
-from tests.experiments.blind.recipes import RECIPES
+from tests.experiments.blind.recipes import RECIPES, scaled
 from tests.experiments.blind.rivals import Rivals
 from tests.experiments.blind.world import Effect, TemperatureProfile, World, model_text
 
@@ -239,6 +239,11 @@ def test_pair_on_one_axis() -> None:
     first, second = case.truth["hidden"]
     assert first["axis"] == second["axis"]
     assert (first["effect"], second["effect"]) == ("bias_step", "outliers")
+
+
+def test_half_of_the_heavy_tails_has_twice_the_degrees_of_freedom() -> None:
+    tails = Effect("gx", "heavy_tails", {"nu": 5.0})
+    assert scaled(tails, make_sensor(), 0.5).parameters["nu"] == 10.0
 
 
 def test_vocabulary_is_complete() -> None:
