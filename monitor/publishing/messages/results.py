@@ -10,6 +10,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Event, Floats
+from drivers.validation.number_ranges import RATE_HZ
 from drivers.zenoh.credential_masking import mask_secrets
 from monitor.common import topics
 from monitor.common.device_health import Health
@@ -33,6 +34,11 @@ MAX_AVERAGING_TIMES: Final = 1000
 MAX_TEXT_LENGTH: Final = 400
 """Largest length of received texts, which limits the memory use of the receiver."""
 MAX_OUTPUTS: Final = 16
+MAX_TIME_S: Final = 1e11
+"""Largest Unix time, averaging time and duration in a received message [s]. Larger numbers overflow as nanoseconds."""
+MIN_TIME_S: Final = 1e-9
+MAX_DEVIATION: Final = 1e100
+"""Largest Allan deviation in a received message [SI units]. The square of a larger number may overflow."""
 STATUSES: Final = {status.name.lower(): status for status in Status}
 STATUS_NAMES: Final = tuple(STATUSES)
 OTHERS: Final = {"K": "R", "R": "K"}
@@ -132,19 +138,25 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
         Raises
         ------
         ValueError
-            If the averaging times are not positive and increasing, or if the numbers of deviations and averaging times
-            differ.
+            If the averaging times are not positive and increasing, if the numbers of deviations and averaging times
+            differ, or if a number is outside the supported range.
         """
         tau_s, m = self.tau_s, self.tau_s.size
         rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
         rising = tau_s.ndim == 1 and bool(np.all(tau_s > 0.0) and np.all(np.diff(tau_s) > 0.0))
         if not 0 < m <= MAX_AVERAGING_TIMES or not rising or not rate_hz > 0.0 or self.t is None:
             raise ValueError("the averaging times must be positive and increasing")
+        if tau_s[0] < MIN_TIME_S or max(tau_s[-1], abs(self.t), abs(filled_s)) > MAX_TIME_S:
+            raise ValueError(f"the times must be from {MIN_TIME_S:g} to {MAX_TIME_S:g} s")
+        if not RATE_HZ.low <= rate_hz <= RATE_HZ.high:
+            raise ValueError(f"the sample rate is {rate_hz:g} Hz")
         deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
         for i, axis in enumerate(AXES):
             if curve := self.axes.get(axis):
                 if not curve.deviation.shape == curve.lo.shape == curve.hi.shape == (m,):
                     raise ValueError(f"{axis}: the number of deviations differs from {m} averaging times")
+                if np.any(np.abs(curve.deviation) > MAX_DEVIATION):
+                    raise ValueError(f"{axis}: a deviation is larger than {MAX_DEVIATION:g}")
                 deviation[:, i], lo[:, i], hi[:, i] = curve.deviation, curve.lo, curve.hi
         factors, terms = np.rint(tau_s * rate_hz).astype(np.int64), np.zeros((m, len(AXES)), np.int64)
         edf = np.full((m, len(AXES)), np.nan)

@@ -71,6 +71,19 @@ def test_invalid_curve_is_refused(changed: dict[str, object]) -> None:
         encode_and_decode(example_results.make_estimate(), **changed)
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"t": 1e308}, {"t": -1e308}, {"filled": 1e308}, {"rate": 1e308}, {"rate": 1e-308},
+        {"tau": [1e-300], "axes": {}}, {"tau": [1e300], "axes": {}},
+        {"tau": [1.0], "axes": {"gx": {"deviation": [1e300], "lo": [1.0], "hi": [1.0]}}},
+    ],
+)  # fmt: skip
+def test_numbers_that_overflow_are_refused(changed: dict[str, object]) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - any message is acceptable
+        encode_and_decode(example_results.make_estimate(), **changed)
+
+
 def test_decoded_health_and_event_equal_the_originals() -> None:
     sent = example_results.make_health(text="viewer is slow")
     got = StatusMessage.decode(StatusMessage.from_result("a", 1.0, 0, sent).encode()).to_health()
