@@ -18,7 +18,7 @@ fitting the power in each of ``SATURATED_BANDS`` frequency bands is used if it i
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from math import exp, log
+from math import exp, inf, log
 from typing import Final
 
 import numpy as np
@@ -42,13 +42,14 @@ from monitor.noise.effects import (
 )
 from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
-from monitor.reconcile.effect_properties import SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import AllanInfluence, DiagnosticGap, RemainingGap
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult
+from monitor.reconcile.search.trials import Trial
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "spectrum": ("psd", "lines", "autocorrelation"),
@@ -138,7 +139,7 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
         if isinstance(effect, (Resolution, Saturation, RandomSampleHold)):
             found[at] = value_artifact_gain(hypothesis.fit, type(effect))
         elif isinstance(effect, EFFECTS_OUTSIDE_SPECTRUM):
-            trials = [one.trials[0] for one in search.rounds if one.trials[0].name == effect.name]
+            trials = _trials_of_effect(search, effect)
             # the likelihood of the spectrum already contains the power of jumps
             has_spectrum = isinstance(effect, JUMP_PROCESSES)
             found[at] = max((one.gain_over_same_spectrum if has_spectrum else one.score for one in trials), default=0.0)
@@ -147,6 +148,17 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
             found[at] = next((one.score for one in trials if one.effect == effect), 0.0)
     moved = {one.trials[0].moved: one.trials[0].score for one in search.rounds if one.trials[0].moved is not None}
     return found | {at: score for at, score in moved.items() if at is not None}
+
+
+def _trials_of_effect(search: AxisSearchResult, effect: Effect) -> list[Trial]:
+    """Return the accepted trials whose effect has the same name and is closest in the identity parameter."""
+    trials = [one.trials[0] for one in search.rounds if one.trials[0].name == effect.name]
+    identity = EFFECT_PROPERTIES[effect.name].identity
+    place = getattr(effect, identity, None)
+    if place is None:
+        return trials
+    distances = [abs((getattr(one.effect, identity, None) or inf) - place) for one in trials]
+    return [one for one, distance in zip(trials, distances, strict=True) if distance == min(distances)]
 
 
 def value_artifact_gain(fit: AxisFit, kind: type[Effect]) -> float:

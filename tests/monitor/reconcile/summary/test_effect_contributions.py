@@ -1,5 +1,6 @@
 """Tests that the parts of the gap are complete and never negative, even for quantized values."""
 
+from dataclasses import replace
 from functools import cache
 from math import sqrt
 
@@ -10,6 +11,7 @@ from monitor.noise.effects import (
     AngleRandomWalk,
     BandwidthLimit,
     Narrowband,
+    NoiseStep,
     Outliers,
     PoissonSteps,
     Resolution,
@@ -97,6 +99,18 @@ def test_outliers_have_the_gain_of_their_test():
     trial = Trial("outliers", with_outliers.added[0], 200.0)
     gains = decompose_explained_gain(search(with_outliers, trial), fitted_first=True)
     assert gains == {2: pytest.approx(200.0)}
+
+
+def test_each_of_two_noise_steps_has_the_gain_of_its_own_test():
+    hypothesis = louder_with_line()
+    steps = [NoiseStep(ratio=2.0, time=50.0), NoiseStep(ratio=1.5, time=150.0)]
+    both = Hypothesis(MODEL, hypothesis.axis.fit((*MODEL, *steps), frozenset({0, 1})))
+    trials = [
+        Trial("noise_step", replace(one, time=one.time + 1.0), gain)
+        for one, gain in zip(steps, (200.0, 30.0), strict=True)
+    ]
+    gains = decompose_explained_gain(search(both, *trials), fitted_first=True)
+    assert gains == {2: pytest.approx(200.0), 3: pytest.approx(30.0)}
 
 
 def test_power_of_random_jumps_counts_once():
