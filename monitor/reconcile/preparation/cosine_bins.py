@@ -166,7 +166,7 @@ def sinusoid_cosine_transforms(turns_per_sample: float, first_sample: int, half_
     Parameters
     ----------
     turns_per_sample : float
-        Frequency as a fraction of the sample rate, between 0 and 1/2.
+        Frequency as a fraction of the sample rate. Frequencies above 1/2 are aliased.
     first_sample : int
         Index of the first sample. The phase is zero at the index 0.
     half_sines : ndarray of float64, shape (n − 1,)
@@ -185,6 +185,10 @@ def sinusoid_cosine_transforms(turns_per_sample: float, first_sample: int, half_
     True
     """
     n = half_sines.size + 1
+    alias = turns_per_sample - round(turns_per_sample)
+    if alias != turns_per_sample:  # an error of the sample rate may move a line beyond half the stated rate
+        sine, cosine = sinusoid_cosine_transforms(abs(alias), first_sample, half_sines)
+        return [float(np.sign(alias)) * sine, cosine]
     omega, half_cosines = 2.0 * np.pi * turns_per_sample, half_sines[::-1]
     # two equal forms of (cos ω − cos θ)/2, of which the one with the smaller rounding error is used
     if turns_per_sample < 0.25:

@@ -6,7 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter, periodogram
 
-from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
+from monitor.reconcile.preparation.cosine_bins import (
+    build_frequency_bins,
+    cosine_transform,
+    inverse_cosine_transform,
+    sinusoid_cosine_transforms,
+)
 
 
 def make_transform_matrix(n):
@@ -100,3 +105,13 @@ def test_short_array_is_summed_as_if_padded_with_zeros():
     for size in (1, 48, 5000, 9999):
         padded = np.where(np.arange(9999) < size, products, 0.0)
         np.testing.assert_allclose(bins.sum_over_bins(products[:size]), bins.sum_over_bins(padded), atol=1e-9)
+
+
+@pytest.mark.parametrize("turns", [0.1, 0.4999, 0.5001, 0.6, 0.75, 1.3])
+def test_transform_of_a_sinusoid_is_exact_even_beyond_half_the_sample_rate(turns):
+    n, first = 1000, 5
+    phase = 2.0 * np.pi * turns * np.arange(first, first + n)
+    half_sines = np.sin(0.5 * np.pi * np.arange(1, n) / n)
+    sine, cosine = sinusoid_cosine_transforms(turns, first, half_sines)
+    assert sine == pytest.approx(cosine_transform(np.sin(phase)), abs=1e-8)
+    assert cosine == pytest.approx(cosine_transform(np.cos(phase)), abs=1e-8)
