@@ -139,7 +139,7 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
         labels = _tau_labels(allan_history.tau_s, height) + _time_labels(allan_history, height) + _bar_labels(height)
         picture = rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0)
         log(f"{path}/{axis}", picture, label_points(labels))
-        if len(whole) == MIN_COLUMNS:  # the height is constant for the following columns
+        if np.isfinite(whole[:, :, i]).any(axis=1).sum() <= MIN_COLUMNS:  # the height is constant afterwards
             log(f"{path}/{axis}/scale", _bar(height), static=True)
 
 

@@ -124,6 +124,17 @@ def test_colour_scale_ends_at_twice_and_half_the_median() -> None:
     assert blue[2] > blue[0]
 
 
+def test_axis_that_is_measured_later_has_a_colour_scale() -> None:
+    avar = ESTIMATE.curve.avar.copy()
+    avar[:, 4] = np.nan
+    partial = replace(ESTIMATE, curve=replace(ESTIMATE.curve, avar=avar))
+    history, logged = AllanHistory(column_s=1.0), set()
+    for t in range(12):
+        history.add_estimate_and_check_column_complete(float(t), partial if t < 8 else ESTIMATE)
+        allan_history_heat_map.draw_heat_maps(lambda path, *_, **__: logged.add(path), "dynamic", history)
+    assert {f"dynamic/{axis}/scale" for axis in AXES} <= logged
+
+
 def test_recording_has_surfaces_labels_and_marks(tmp_path: Path) -> None:
     path = tmp_path / "scene.rrd"
     stream = rr.RecordingStream("imu-monitor")
