@@ -20,6 +20,8 @@ from drivers.validation.number_ranges import DAY_S, HOUR_S
 Kind = Literal["gyro", "accel"]
 KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")
 KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
+SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
+"""Names for titles and tables with little space."""
 
 DEGREE: Final = 180.0 / math.pi  # degrees per radian
 ROOT_HOUR: Final = 60.0  # √s per √h

@@ -53,6 +53,29 @@ def format_coefficient(
             return CoefficientText(NO_VALUE, "", unit.name)
 
 
+def format_relative_interval(coefficients: Coefficients, symbol: str, axis: str) -> str:
+    """Return the distances of the ends of a 95 % interval from its value in percent, such as "±0.6 %" or "−21 +24 %".
+
+    The text is empty if there is no interval.
+
+    Parameters
+    ----------
+    coefficients
+        Noise coefficients of all axes.
+    symbol
+        Symbol of the coefficient: Q, N, B, K or R.
+    axis
+        Name of the axis.
+    """
+    at = SYMBOLS.index(symbol), AXES.index(axis)
+    value, lo, hi = (float(a[at]) for a in (coefficients.value, coefficients.lo, coefficients.hi))
+    if Status(int(coefficients.status[at])) is not Status.ESTIMATED or value <= 0.0:
+        return ""
+    percent = [100.0 * part / value for part in (value - lo, hi - value)]
+    below, above = (f"{one:.0f}" if one >= 1.0 else f"{one:.1g}" for one in percent)
+    return f"±{above} %" if below == above else f"−{below} +{above} %"
+
+
 def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
     """Append TEMPERATURE_MARK to the name of an axis if temperature explains most of the axis's slow variance.
 

@@ -17,6 +17,8 @@ from monitor.publishing.plots.style import format_tick
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
+MIN_DECADES_OF_LONG_AXIS: Final = 4
+"""Smallest number of decades of an axis on which a small plot labels every second power of ten only."""
 RING_RADIUS: Final = 0.28
 MARKER_RADIUS: Final = 0.2
 MINOR_TICK: Final = 0.16  # length of the ticks between powers of ten
@@ -176,6 +178,37 @@ def chart_grid(scale: ChartDecadeRange, x_unit: str = "") -> ChartGrid:
         + [np.array([[0.0, flip - y], [MINOR_TICK, flip - y]]) for y in y_minor],
         ticks=ticks,
     )
+
+
+def few_tick_labels(scale: ChartDecadeRange, x_unit: str = "") -> list[tuple[float, float, str]]:
+    """Return tick labels for a small plot, each given by x, y and text, at every second power of ten of a long axis.
+
+    >>> [text for _, _, text in few_tick_labels(ChartDecadeRange((-2, 2), (1, 3)), " s")]
+    ['0.01', '1', '100 s', '10', '100', '1000']
+
+    Parameters
+    ----------
+    scale
+        Range of averaging times and Allan deviations.
+    x_unit
+        Text after the last number of the x axis.
+    """
+    (left, right), (bottom, top) = scale.x, scale.y
+    x_powers, y_powers = (
+        range(low, high + 1, 1 if high - low < MIN_DECADES_OF_LONG_AXIS else 2) for low, high in (scale.x, scale.y)
+    )
+    across = [
+        (
+            (power - left) / (right - left) * WIDTH,
+            HEIGHT + 0.15,
+            format_tick(10.0**power) + (x_unit if power == x_powers[-1] else ""),
+        )
+        for power in x_powers
+    ]
+    return across + [
+        (-2.5, (top - power) / (top - bottom) * HEIGHT - 2.0 * LABEL_ABOVE, format_tick(10.0**power))
+        for power in y_powers
+    ]
 
 
 def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:

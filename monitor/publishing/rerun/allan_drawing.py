@@ -27,6 +27,7 @@ from monitor.publishing.rerun.allan_chart_geometry import (
     chart_grid,
     dash_line,
     decade_range,
+    few_tick_labels,
     finite_sections,
     marker_outlines,
     ring_outline,
@@ -51,6 +52,8 @@ KEY_TEXT: Final = 3.3
 GRID_PERIOD_NS: Final = 30_000_000_000
 """Interval at which an unchanged grid is drawn again, because a viewer that joins late may not receive old data."""
 GRID_DASH: Final = 0.15
+FEW_TICKS: Final = "few_ticks"
+"""Last part of the path of the tick labels for small plots."""
 LETTER_OFFSETS: Final = {"N": (-0.9, -0.3), "B": (0.9, -0.3), "K": (0.9, -0.3)}
 """Position of each letter relative to its rings, on the side where the curve leaves space."""
 FIT_WIDTH: Final = 1.25  # half of the line width [points of the screen]
@@ -124,12 +127,13 @@ class AllanPlotPair:
                     radii=rr.Radius.ui_points([line.radius for line in lines]),
                     draw_order=10.0,
                 ),
-                letters,
             )
+            self._log(f"{self._path}/{kind}/letters", letters)
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
         log_grid(self._log, path, scale, f"{path}/ticks", x_unit=" s")
+        self._log(f"{path}/{FEW_TICKS}", label_points(few_tick_labels(scale, " s")))
         at = {axis: np.array([4.0 * i + 4.6, -0.9]) for i, axis in enumerate(axes)}
         strokes = [position + np.array([[-0.7, 0.0], [0.7, 0.0]]) for position in at.values()]
         log_lines(

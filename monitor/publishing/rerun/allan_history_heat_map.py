@@ -99,7 +99,7 @@ class AllanHistory:
         return np.asarray(whole - median)
 
 
-HEIGHT: Final = 50  # approximate height of a heat map [pixels]; three heat maps fit into a tab
+HEIGHT: Final = 65  # approximate height of a heat map [pixels]
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
 NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
@@ -108,7 +108,7 @@ LABEL_ABOVE_PX: Final = 6.0  # distance of the point of a label above the centre
 TIME_INSET_PX: Final = 20.0  # distance of the time labels from the ends of the image
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
-LABEL_MARGINS_PX: Final = (34.0, 7.0, 32.0, 20.0)  # left, above, right and below the image, for labels
+LABEL_MARGINS_PX: Final = (44.0, 7.0, 52.0, 20.0)  # left, above, right and below the image, for labels
 
 
 def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -181,7 +181,7 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
     powers = range(int(np.ceil(log[0])), int(np.floor(log[-1])) + 1, 2)  # more labels would overlap in a small window
     rows = np.interp(list(powers), log, (np.arange(log.size) + 0.5) / log.size)
     return [
-        (-14.0, height * (1.0 - float(row)) - LABEL_ABOVE_PX, f"{10.0**power:g}{' s' if power == powers[-1] else ''}")
+        (-23.0, height * (1.0 - float(row)) - LABEL_ABOVE_PX, f"{10.0**power:g}{' s' if power == powers[-1] else ''}")
         for power, row in zip(powers, rows, strict=True)
     ]
 
@@ -197,7 +197,7 @@ def _bar_labels(height: int) -> list[tuple[float, float, str]]:
         (f"× {COLOUR_SCALE_RATIO:g}", "× 1", f"× {1 / COLOUR_SCALE_RATIO:g}"),
         strict=True,
     )
-    return [(BAR_X + 14.0, y - LABEL_ABOVE_PX, text) for y, text in ends]
+    return [(BAR_X + 23.0, y - LABEL_ABOVE_PX, text) for y, text in ends]
 
 
 def _bar(height: int) -> rr.LineStrips2D:

@@ -5,31 +5,31 @@ The tab of a device has a page for its present noise, for changes, for the model
 layout contains only views whose entities have data. Importing this module imports Rerun.
 """
 
+import math
 import re
 from collections.abc import Collection, Sequence
 from typing import Any, Final
 
 import rerun.blueprint as rrb
-from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.common.unit_formatting import (
     DEFAULT_UNITS,
     KIND_NAMES,
     KINDS,
     SAMPLE_UNITS,
+    SHORT_KIND_NAMES,
     Kind,
     UnitSystem,
     axes_of,
 )
 from monitor.publishing.rerun import allan_history_heat_map
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, WIDTH
-from monitor.publishing.rerun.allan_drawing import KEY_BELOW, KEY_ROW
+from monitor.publishing.rerun.allan_drawing import FEW_TICKS, KEY_BELOW, KEY_ROW
 from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,
     collapsed_blueprint,
     drawing_view,
-    temperature_view,
     time_series_view,
 )
 from monitor.publishing.rerun.viewer_scene import PANELS
@@ -39,9 +39,8 @@ NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
 """Number of averaging times of a sliding window of one hour at 100 Hz."""
-MAX_DEVICES_WITH_ACCEL: Final = 4
-"""Largest number of devices for which the overview shows accelerometers as well as gyroscopes."""
-SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
+MAX_DEVICES_WITH_LEGEND: Final = 4
+"""Largest number of devices whose Allan plots in the overview have space for a legend and for all tick labels."""
 ALWAYS_SHOWN: Final = ("/status", "/waiting", "/overview")
 """Path suffixes of views that are shown before their first data arrive."""
 GUIDE: Final = "/guide/"
@@ -52,8 +51,8 @@ DESCRIPTIONS: Final = {
     "coefficients": "**What is its noise now?** Q quantization, N white noise, B bias instability, K random walk and R "
     "ramp, with 95 % intervals.",
     "events": "**Has it changed?** Changes of the noise, losses of samples and faults of the link, with UTC times.",
-    "allan": "**Allan deviation:** noise (up) that remains after averaging for a time (right); lower is better. Signs: "
-    "● x, □ y, △ z measured, line fit, thin lines 95 %, ring N, B or K, dashes model, grey line poor fit.",
+    "allan": "**Allan deviation:** noise (up) that remains after averaging for a time (right); lower is better. "
+    "Orange ● x, green □ y, blue △ z, line fit, thin lines 95 %, ring N, B or K, dashes model, grey line poor fit.",
     "coefficients/[NBK]": "**N, B, K over time:** a step is a change of the noise, and thin lines are 95 % intervals.",
     "samples": "**Samples:** the last 30 seconds as measured.",
     "temperature": "**Temperature:** as the sensor reports it.",
@@ -142,8 +141,8 @@ def _has_data(part: rrb.Container | rrb.View, entities: Collection[str]) -> bool
 
 def _device(device: ViewerDeviceDescription, waiting: bool, units: UnitSystem) -> rrb.Container:
     pages = [_now(device.name, waiting, units), _changes(device.name, units)]
-    if parts := [part for panel in PANELS if (part := panel.page_part(device, units)) is not None]:
-        pages.append(_temperature_and_drift(device.name, parts))
+    guides = ((panel, _guide(device.name, panel.__name__)) for panel in PANELS)
+    pages += [page for panel, guide in guides if (page := panel.own_page(device, units, guide)) is not None]
     if device.has_model:
         pages.append(_model_gap(device.name, units))
     return rrb.Tabs(*pages, active_tab=0, name=device.name)
@@ -154,90 +153,97 @@ def _now(name: str, waiting: bool, units: UnitSystem) -> rrb.Container:
         rrb.TextDocumentView(
             origin=f"/{name}/{'waiting' if waiting else 'status'}", contents="$origin", name="Is it healthy?"
         ),
-        rrb.TextDocumentView(origin=f"/{name}/coefficients", contents="$origin", name="What is its noise now?"),
-        rrb.Tabs(_event_log(f"/{name}/events"), _guide(name, "now"), active_tab=0),
-        row_shares=[1.9, 6.5, 1.6],
+        rrb.Tabs(
+            rrb.TextDocumentView(origin=f"/{name}/coefficients", contents="$origin", name="What is its noise now?"),
+            _guide(name, "now"),
+            active_tab=0,
+        ),
+        row_shares=[2.0, 4.1],
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS)),
         rrb.Horizontal(*(_coefficient(name, kind, symbol, units) for kind in KINDS for symbol in NOW_COEFFICIENTS)),
-        rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[5, 5, 3]),
+        rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), _event_list(f"/{name}/events"), column_shares=[4, 4, 6]),
         row_shares=[5.0, 2.2, 2.2],
     )
-    return rrb.Horizontal(left, right, column_shares=[3, 7], name="Device")
+    return rrb.Horizontal(left, right, column_shares=[1, 2], name="Device")
 
 
 def _changes(device: str, units: UnitSystem) -> rrb.Container:
-    columns = [
-        rrb.Vertical(
-            *(_heat_map(device, axis) for axis in axes_of(kind)),
-            rrb.Horizontal(*(_coefficient(device, kind, symbol, units) for symbol in DYNAMIC_COEFFICIENTS)),
-            row_shares=[3, 3, 3, 2.7],
-        )
-        for kind in KINDS
-    ]
-    texts = rrb.Horizontal(_event_log(f"/{device}/events"), _guide(device, "changes"))
-    return rrb.Vertical(rrb.Horizontal(*columns), texts, row_shares=[5, 1], name="What changed")
+    maps = [rrb.Horizontal(*(_heat_map(device, axis) for axis in axes_of(kind))) for kind in KINDS]
+    lines = [_coefficient(device, kind, symbol, units) for kind in KINDS for symbol in DYNAMIC_COEFFICIENTS]
+    texts = rrb.Horizontal(_event_list(f"/{device}/events"), _guide(device, "changes"), column_shares=[3, 2])
+    return rrb.Vertical(*maps, rrb.Horizontal(*lines), texts, row_shares=[2.1, 2.1, 2.9, 2.9], name="What changed")
 
 
 def _model_gap(device: str, units: UnitSystem) -> rrb.Container:
     plots = rrb.Horizontal(*(_allan(device, kind, units) for kind in KINDS))
-    return rrb.Vertical(
-        rrb.Horizontal(*(_gap(device, kind) for kind in KINDS)), plots, _guide(device, "gap"), row_shares=[3, 5, 1],
-        name="Model gap",
-    )  # fmt: skip
-
-
-def _temperature_and_drift(device: str, parts: Sequence[rrb.Container]) -> rrb.Container:
-    return rrb.Vertical(
-        rrb.Horizontal(*parts), _guide(device, "temperature"), row_shares=[5, 1], name="Temperature and drift"
-    )
+    gaps = rrb.Horizontal(*(_gap(device, kind) for kind in KINDS), _guide(device, "gap"), column_shares=[2, 2, 1])
+    return rrb.Vertical(gaps, plots, row_shares=[3, 5], name="Model gap")
 
 
 def _overview(devices: Sequence[str], units: UnitSystem, fleet: bool) -> rrb.Container:
-    many, name = len(devices) > MAX_DEVICES_WITH_ACCEL, "Fleet" if fleet else "Overview"
-    if not fleet and not many:
-        charts = [_allan(device, kind, units, f"{device}: ") for kind in KINDS for device in devices]
-        above = rrb.Horizontal(*_overview_texts(), column_shares=[11, 9])
-        return rrb.Vertical(above, rrb.Grid(*charts, grid_columns=len(devices)), row_shares=[1, 4], name=name)
-    beside = rrb.Vertical(*_overview_texts(), row_shares=[4, 1])
-    kinds = KINDS[:1] if many else KINDS
-    charts = [_allan(device, kind, units, f"{device}: ") for device in devices for kind in kinds]
-    if not charts:
-        return rrb.Vertical(beside, name=name)
-    columns = 3 if many else min(len(devices), 2)
-    return rrb.Horizontal(beside, rrb.Grid(*charts, grid_columns=columns), column_shares=[1, 1], name=name)
-
-
-def _overview_texts() -> tuple[rrb.View, rrb.Container]:
-    table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Are they healthy?")
-    return table, rrb.Tabs(_event_log("/overview/events"), _guide("", "overview"), active_tab=0)
+    texts = rrb.Vertical(
+        rrb.Tabs(
+            rrb.TextDocumentView(origin="/overview", contents="$origin", name="Are they healthy?"),
+            _guide("", "overview"),
+            active_tab=0,
+        ),
+        _event_list("/overview/events"),
+        row_shares=[5, 2],
+    )
+    name = "Fleet" if fleet else "Overview"
+    if not devices:
+        return rrb.Vertical(texts, name=name)
+    columns = math.ceil(math.sqrt(len(devices)))
+    grids = [
+        rrb.Grid(
+            *(_small_allan(device, kind, len(devices)) for device in devices),
+            grid_columns=columns,
+            name=_allan_title(kind, units),
+        )
+        for kind in KINDS
+    ]
+    return rrb.Horizontal(texts, rrb.Tabs(*grids, active_tab=0), column_shares=[2, 3], name=name)
 
 
 def _guide(device: str, page: str) -> rrb.View:
     return rrb.TextDocumentView(origin=f"{device}{GUIDE}{page}", contents="$origin", name="How to read this page")
 
 
-def _event_log(origin: str) -> rrb.View:
-    hidden = TimelineColumn(timeline=TIMELINE, visible=False)
-    columns = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
-    return rrb.TextLogView(origin=origin, name="Has it changed?", columns=columns)
+def _event_list(origin: str) -> rrb.View:
+    return rrb.TextDocumentView(origin=origin, contents="$origin", name="Has it changed?")
 
 
 def _heat_map(device: str, axis: str) -> rrb.View:
     x, y = allan_history_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
-    name = f"{axis}: Allan deviation over time, relative to its median"
+    name = f"{axis}: Allan deviation relative to its median"
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
-def _allan(device: str, kind: Kind, units: UnitSystem, prefix: str = "") -> rrb.View:
-    paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
-    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {units.deviation(kind).name}"
+def _allan(device: str, kind: Kind, units: UnitSystem) -> rrb.View:
     bottom = HEIGHT + KEY_BELOW + 2.0 * KEY_ROW
-    if prefix:  # small plots have no space for a key
-        paths.append(f"- /{device}/allan/{kind}/key/**")
-        name, bottom = f"{prefix}{SHORT_KIND_NAMES[kind]}, {units.deviation(kind).name}", HEIGHT + 1.6
-    return drawing_view(f"/{device}/allan", name, paths, (-3.1, WIDTH + 1.8), (-1.8, bottom))
+    contents = [*_allan_contents(device, kind), f"- /{device}/allan/{kind}/{FEW_TICKS}"]
+    return drawing_view(f"/{device}/allan", _allan_title(kind, units), contents, (-3.1, WIDTH + 1.8), (-1.8, bottom))
+
+
+def _small_allan(device: str, kind: Kind, device_count: int) -> rrb.View:
+    """Return an Allan plot of the overview, without the parts for which it has no space."""
+    left_out: Sequence[str] = ("key/**", FEW_TICKS)
+    x_range, y_range = (-3.1, WIDTH + 1.8), (-1.8, HEIGHT + 1.6)
+    if device_count > MAX_DEVICES_WITH_LEGEND:
+        left_out = ("key/**", "ticks", "legend/**", "letters")
+        x_range, y_range = (-4.6, WIDTH + 2.8), (-1.2, HEIGHT + 3.0)
+    contents = [*_allan_contents(device, kind), *(f"- /{device}/allan/{kind}/{one}" for one in left_out)]
+    return drawing_view(f"/{device}/allan", device, contents, x_range, y_range)
+
+
+def _allan_contents(device: str, kind: Kind) -> list[str]:
+    return [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
+
+
+def _allan_title(kind: Kind, units: UnitSystem) -> str:
+    return f"{KIND_NAMES[kind]}: Allan deviation, {units.deviation(kind).name}"
 
 
 def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb.View:
@@ -246,11 +252,11 @@ def _coefficient(device: str, kind: Kind, symbol: str, units: UnitSystem) -> rrb
 
 
 def _raw(device: str, kind: Kind) -> rrb.View:
-    name = f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}"
+    name = f"{SHORT_KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}"
     contents = [f"$origin/{axis}" for axis in axes_of(kind)]
     return time_series_view(f"/{device}/samples", name, contents, RAW_SAMPLES_S, legend=True)
 
 
 def _gap(device: str, kind: Kind) -> rrb.View:
-    name = f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold"
+    name = f"{SHORT_KIND_NAMES[kind]}: gap to the model and its threshold, σ"
     return time_series_view(f"/{device}/gap", name, [f"$origin/{kind}"])

@@ -59,8 +59,8 @@ class DriftPanel(Panel):
         self._log_text("drift", float(unix_s[-1]), drift_text(results[-1], self.scene.units))
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the views of the drift, or None if the gyroscope drift of the device is not compensated."""
+    def own_page(cls, device: ViewerDeviceDescription, units: UnitSystem, guide: rrb.View) -> rrb.Container | None:
+        """Return the page of the drift, or None if the gyroscope drift of the device is not compensated."""
         if not device.compensated:
             return None
         name = device.name
@@ -75,7 +75,7 @@ class DriftPanel(Panel):
             innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
             rows.append(rrb.Horizontal(rates, drift, innovation))
         text = rrb.TextDocumentView(origin=f"/{name}/drift", contents="$origin", name="Drift of the gyros")
-        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 3.2])
+        return rrb.Vertical(*rows, rrb.Horizontal(text, guide), row_shares=[3, 3, 3, 4.4], name="Drift")
 
 
 class ThermalPredictionPanel(Panel):
@@ -110,14 +110,14 @@ class ThermalPredictionPanel(Panel):
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the views of the bias and the temperature, or None if the bias is not predicted from temperature."""
+    def own_page(cls, device: ViewerDeviceDescription, units: UnitSystem, guide: rrb.View) -> rrb.Container | None:
+        """Return the page of the temperature, and of the bias if it is predicted from temperature."""
+        below = rrb.Horizontal(temperature_view(device.name), guide)
         if not device.has_thermal:
-            return None
+            return rrb.Vertical(below, name="Temperature")
         columns = []
         for kind in KINDS:
             title = f"bias, {units.deviation(kind).name}"
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
-        temperature = temperature_view(device.name)
-        return rrb.Vertical(rrb.Horizontal(*columns), temperature, row_shares=[4, 1])
+        return rrb.Vertical(rrb.Horizontal(*columns), below, row_shares=[4, 1], name="Temperature")

@@ -54,8 +54,8 @@ class Panel:
         """Draw the stored history of the device."""
 
     @classmethod
-    def page_part(cls, device: ViewerDeviceDescription, units: UnitSystem) -> rrb.Container | None:
-        """Return the views of the panel on the page for temperature and drift, or None if there are none.
+    def own_page(cls, device: ViewerDeviceDescription, units: UnitSystem, guide: rrb.View) -> rrb.Container | None:
+        """Return the page that only this panel fills, or None if there is no such page.
 
         Parameters
         ----------
@@ -63,6 +63,8 @@ class Panel:
             Device to show.
         units
             Units of the plots.
+        guide
+            View with the text that describes the page.
         """
         return None
 

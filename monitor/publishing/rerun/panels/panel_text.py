@@ -9,8 +9,9 @@ from typing import Final
 from monitor.common.device_health import Health
 from monitor.common.unit_formatting import (
     DEFAULT_UNITS,
-    KIND_NAMES,
     KINDS,
+    NO_VALUE,
+    SHORT_KIND_NAMES,
     Kind,
     Unit,
     UnitSystem,
@@ -19,18 +20,22 @@ from monitor.common.unit_formatting import (
     format_milliseconds,
     format_number,
     format_sample_rate,
+    format_utc,
 )
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDrift
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients
+from monitor.publishing.coefficient_cells import format_coefficient, format_relative_interval
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import measured_axes
 from monitor.publishing.remote_device_states import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose angle random walk N is shown in the table of all devices."""
+MAX_SHOWN_PROBLEMS: Final = 6
+"""Largest number of problems above the table of all devices."""
+PROGRESS_BAR: Final = re.compile(" ?[█░]+")
 LINE_BREAK: Final = "  \n"
 """Line break of Markdown, which needs less space than a new paragraph."""
 STATE_TEXTS: Final = {
@@ -57,31 +62,38 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     rate = unknown if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
     lines = [f"**{device}** {about}".rstrip() + f", **{rate}**", f"## {STATE_TEXTS.get(health.state, health.state)}"]
     if health.text:
-        lines.append(f"**{health.text}**")
+        lines.append(f"**{escape_markdown(health.text)}**")
     if health.crossed:
         lines.append(f"limits exceeded: **{', '.join(health.crossed)}**")
     lines.append(
         f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
     )
+    latency = [format_milliseconds(one) for one in (health.latency_p50_s, health.latency_p99_s)]
+    lines.append(
+        f"latency **{latency[0]}** median, **{latency[1]}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
+    )
     outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
     lines.append(f"up **{format_duration(health.uptime_s)}**{outputs}")
-    lines.append(
-        f"latency **{format_milliseconds(health.latency_p50_s)}** median, "
-        f"**{format_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
-    )
     return "\n".join([*lines[:2], LINE_BREAK.join(lines[2:])])
 
 
 def overview_text(healths: Mapping[str, Health]) -> str:
-    """Return a Markdown table of several devices with one line for each device."""
+    """Return the problems of several devices, and a Markdown table with one line for each device."""
+    problems = [(escape_markdown(name), escape_markdown(h.text)) for name, h in healths.items() if h.text]
     rows = [
-        f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} "
-        f"| {h.text or 'no problem'} |"
+        f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} |"
         for name, h in healths.items()
     ]
-    head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
-    return "\n".join([head, *rows])
+    head = "| device | state | rate | received | lost | bad |\n|:--|:--|--:|--:|--:|--:|"
+    return "\n".join([*_problem_list(problems), head, *rows])
+
+
+def _problem_list(problems: Sequence[tuple[str, str]]) -> list[str]:
+    """Return Markdown lines with the problems of devices, because the cells of a table do not wrap long texts."""
+    lines = [f"- **{name}**: {text}" for name, text in problems[:MAX_SHOWN_PROBLEMS]]
+    lines += [f"- … and {len(problems) - len(lines):,} more problems"] if len(problems) > len(lines) else []
+    return [*(lines or ["no problem"]), ""]
 
 
 def fleet_text(
@@ -103,42 +115,72 @@ def fleet_text(
         Units of the noise coefficients.
     """
     counts = Counter(one.state(now_s) for one in devices)
-    states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
+    states = ", ".join(f"**{count:,}** {escape_markdown(state)}" for state, count in counts.most_common())
     unit = units.single("gyro", "N")
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head[0] += f"; N in {unit.name}" if devices else ""
     head += [f"**{remove_control_characters(note)}**"] if note else []
     table = [_fleet_row(one, now_s, unit) for one in devices[:rows]]
     if table:
-        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
-        table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
+        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES)]
+        table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 2), *table]
+    found = ((escape_markdown(one.key), _fleet_problem(one, now_s)) for one in devices)
+    problems = _problem_list([(name, text) for name, text in found if text]) if table else []
     left = [f"… and {len(devices) - rows:,} more with fewer problems"] if len(devices) > rows else []
-    return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
+    return "\n\n".join([*head, *(["\n".join([*problems, *table])] if table else []), *left])
 
 
 def _fleet_row(one: RemoteDevice, now_s: float, unit: Unit) -> str:
     state, status = one.state(now_s), one.status
-    name = _escape_cell(one.key)
-    state_text = f"**{state.upper()}**" if one.problems_first_rank(now_s) == 0 else _escape_cell(state)
+    name = escape_markdown(one.key)
+    state_text = f"**{state.upper()}**" if one.problems_first_rank(now_s) == 0 else escape_markdown(state)
     noise = [
         ""
         if one.coefficients is None
         else format_coefficient(one.coefficients.coefficients, "N", axis, unit=unit).value
         for axis in FLEET_AXES
     ]
-    if status is None:
-        return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | no data yet |"
-    rate = format_sample_rate(status.rate_hz)
-    problems = _escape_cell(one.describe_device_problems()) or (
-        f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
-    )
-    counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
-    return f"| **{name}** | {state_text} | {rate} | {counts} | {' | '.join(noise)} | {problems} |"
+    counts = " | | | "
+    if status is not None:
+        rate = format_sample_rate(status.rate_hz)
+        counts = f"{rate} | {status.received:,} | {status.lost:,} | {status.bad:,}"
+    return f"| **{name}** | {state_text} | {counts} | {' | '.join(noise)} |"
 
 
-def _escape_cell(text: str) -> str:
-    """Escape text from another process, which could otherwise end a table cell or form a link."""
-    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
+def _fleet_problem(one: RemoteDevice, now_s: float) -> str:
+    """Return the problems of one device, or "" if there are none."""
+    if one.status is None:
+        return "no data yet"
+    silent = f"no data for {now_s - one.last_message_s:.1f} s" if one.state(now_s) in ("gone", "silent") else ""
+    return escape_markdown(one.describe_device_problems()) or silent
+
+
+def escape_markdown(text: str) -> str:
+    """Escape text from another process, which could otherwise end a table cell or form a link.
+
+    Progress bars are removed, because the font of the viewer does not contain their characters.
+
+    >>> escape_markdown("imu_1: compiling 3 of 8: fit ███░░░; no sample is lost")
+    'imu\\\\_1: compiling 3 of 8: fit; no sample is lost'
+    """
+    shown = PROGRESS_BAR.sub("", remove_control_characters(text))
+    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", shown)
+
+
+def events_text(lines: Sequence[tuple[float, str, str]]) -> str:
+    """Return a Markdown list of events, newest first. Warnings and errors are bold.
+
+    Parameters
+    ----------
+    lines
+        Unix time [s], level and Markdown text of each event, in order of time. The level of information is "".
+    """
+    times = [format_utc(at_s)[5:] for at_s, _, _ in lines]  # without the year, to save space
+    shown = [
+        f"- **{time} {level}** {text}" if level else f"- {time} {text}"
+        for time, (_, level, text) in zip(times, lines, strict=True)
+    ]
+    return "\n".join(reversed(shown))
 
 
 def noise_text(estimate: Estimate, units: UnitSystem = DEFAULT_UNITS) -> str:
@@ -152,14 +194,15 @@ def noise_text(estimate: Estimate, units: UnitSystem = DEFAULT_UNITS) -> str:
         Unit system.
     """
     present = [axis for _, axis in measured_axes(estimate.curve)]
-    tables = [_noise_table(estimate, kind, units) for kind in KINDS if set(axes_of(kind)) & set(present)]
-    if not tables:
+    kinds = [kind for kind in KINDS if set(axes_of(kind)) & set(present)]
+    if not kinds:
         return "Too few samples yet."
-    seen_s = estimate.curve.n / estimate.rate_hz
-    head = f"Last **{format_duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
+    seen_s = min(estimate.curve.n / estimate.rate_hz, estimate.window_s)
+    head = f"Last **{format_duration(seen_s)}**; ± 95 % interval; ≤ bound; — too few data"
     poor = ", ".join(estimate.poorly_fitted_axes)
     note = [f"**{poor}: the fit does not describe the curve**, so these coefficients are uncertain"] if poor else []
-    return "\n\n".join([head, *note, *tables])
+    rows = [row for kind in kinds for row in _noise_rows(estimate, kind, units)]
+    return "\n\n".join([head, *note, "\n".join([rows[0], "|:--|" + "--:|" * len(axes_of(kinds[0])), *rows[1:]])])
 
 
 def drift_text(update: MeasuredAndSubtractedDrift, units: UnitSystem) -> str:
@@ -199,13 +242,18 @@ def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
-def _noise_table(estimate: Estimate, kind: Kind, units: UnitSystem) -> str:
+def _noise_rows(estimate: Estimate, kind: Kind, units: UnitSystem) -> list[str]:
     axes = axes_of(kind)
-    lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
+    rows = [[f"**{SHORT_KIND_NAMES[kind]}**", *(f"**{axis}**" for axis in axes)]]
     for symbol, _, unit in units.columns(kind, SYMBOLS):
-        cells = [format_coefficient(estimate.coefficients, symbol, axis, unit=unit) for axis in axes]
-        values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
-        lines.append(f"| **{symbol}** {unit.name} | {values} |")
-        if any(c.interval for c in cells):
-            lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
-    return "\n".join(lines)
+        rows.append(
+            [f"**{symbol}** {unit.name}", *(_noise_cell(estimate.coefficients, symbol, axis, unit) for axis in axes)]
+        )
+    return [f"| {' | '.join(row)} |" for row in rows]
+
+
+def _noise_cell(coefficients: Coefficients, symbol: str, axis: str, unit: Unit) -> str:
+    value = format_coefficient(coefficients, symbol, axis, unit=unit).value
+    return (
+        value if value == NO_VALUE else f"**{value}** {format_relative_interval(coefficients, symbol, axis)}".rstrip()
+    )

@@ -93,7 +93,7 @@ TEMPERATURES_PER_S: Final = 5.0
 class _SamplePanel(Panel):
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
         for axis in axes:
-            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", axis_colours.AXIS_COLOURS[axis], 1.0)
+            line = (axis, axis_colours.AXIS_COLOURS[axis], 1.0)
             self._style_lines(f"{name}/{axis}", [line])
 
     def _log_samples(

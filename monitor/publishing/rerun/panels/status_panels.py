@@ -8,19 +8,18 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import rerun as rr
 
 from drivers.data_types import Event, Floats
 from monitor.common.device_health import Health
-from monitor.common.unit_formatting import format_utc
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.rerun.panels.noise_panels import CoefficientsPanel
 from monitor.publishing.rerun.panels.panel import Panel
-from monitor.publishing.rerun.panels.panel_text import health_text, overview_text
+from monitor.publishing.rerun.panels.panel_text import escape_markdown, events_text, health_text, overview_text
 from monitor.publishing.rerun.shared_views import markdown_document
 
 if TYPE_CHECKING:
+    from monitor.publishing.rerun.viewer_scene import AllDevicesScene
     from monitor.publishing.result_kinds import AllDevicesTableText
 
 
@@ -66,8 +65,8 @@ class AllDevicesTablePanel(Panel):
         self.scene.log("overview", markdown_document(text))
 
 
-MAX_PAST_EVENTS: Final = 200
-"""Largest number of stored events that are shown."""
+MAX_SHOWN_EVENTS: Final = 100
+"""Largest number of events in the list of a device and in the list of all devices."""
 WARNING_EVENTS: Final = frozenset({
     "samples_lost",
     "noise_changed",
@@ -82,26 +81,51 @@ WARNING_EVENTS: Final = frozenset({
 
 
 class EventsPanel(Panel):
-    """List of events. A diamond in the plot marks the new value of a changed noise coefficient."""
+    """List of events, newest first. A diamond in the plot marks the new value of a changed noise coefficient.
+
+    The list is a text. A Rerun log would cut long lines, and a viewer that joins late may not receive its old lines.
+    """
+
+    def __init__(self, scene: "AllDevicesScene", device: str) -> None:
+        super().__init__(scene, device)
+        self._lines: list[tuple[float, str, str]] = []  # Unix time [s], level and text of each event, in order of time
 
     def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
-        """Log events, and mark changed noise coefficients in the plots."""
-        for at_s, event in zip(unix_s.tolist(), results, strict=True):
-            level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
-            clock_time = format_utc(at_s)[-8:]  # the time column of the viewer is too narrow for the whole time
-            self.scene.set_log_time(at_s)
-            if self.scene.fleet or len(self.scene.devices) > 1:
-                line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
-                self.scene.log("overview/events", line)
-            if self.device in self.scene.devices:
-                self.scene.log(self.entity_path("events"), rr.TextLog(f"{clock_time}  {event.text}", level=level))
+        """Add events to the lists, and mark changed noise coefficients in the plots."""
+        levels = [
+            "ERROR" if one.kind == "link_lost" else "WARN" if one.kind in WARNING_EVENTS else "" for one in results
+        ]
+        texts = [escape_markdown(one.text) for one in results]
+        lines = list(zip(unix_s.tolist(), levels, texts, strict=True))
+        if self.scene.fleet or len(self.scene.devices) > 1:
+            name = escape_markdown(self.device)
+            named = [(at_s, level, f"{name}: {text}") for at_s, level, text in lines]
+            self.scene.get_or_create_panel("", EventsPanel).log_lines("overview/events", named)
+        if self.device in self.scene.devices:
+            self.log_lines(self.entity_path("events"), lines)
+            for at_s, event in zip(unix_s.tolist(), results, strict=True):
                 self._mark_changes(at_s, event)
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Log the stored events of the device."""
-        for one in history.events[-MAX_PAST_EVENTS:]:
-            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line would otherwise show no date
-            self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
+        """Add the stored events of the device to the lists."""
+        stored = history.events[-MAX_SHOWN_EVENTS:]
+        if stored:
+            events = [Event(one.kind, round(one.t_s * 1e9), one.text, one.axis, one.what) for one in stored]
+            self.draw(np.array([one.t_s for one in stored]), events)
+
+    def log_lines(self, path: str, lines: Sequence[tuple[float, str, str]]) -> None:
+        """Log the list of events after adding lines to it.
+
+        Parameters
+        ----------
+        path
+            Path of the entity with the list.
+        lines
+            Unix time [s], level and Markdown text of each new event.
+        """
+        self._lines = sorted([*self._lines, *lines], key=lambda line: line[0])[-MAX_SHOWN_EVENTS:]
+        self.scene.set_log_time(self._lines[-1][0])
+        self.scene.log(path, markdown_document(events_text(self._lines)))
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
         if event.axis is None:

@@ -6,11 +6,18 @@ import pytest
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from monitor.publishing.rerun.blueprint import DESCRIPTIONS, GUIDE, blueprint, guide_texts, list_views
+from monitor.publishing.rerun.blueprint import (
+    DESCRIPTIONS,
+    GUIDE,
+    MAX_DEVICES_WITH_LEGEND,
+    blueprint,
+    guide_texts,
+    list_views,
+)
 from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDescription
 
 FULL = ViewerDeviceDescription("b", has_model=True, has_thermal=True, compensated=True)
-PAGES = ["Device", "What changed", "Temperature and drift", "Model gap"]
+PAGES = ["Device", "What changed", "Temperature", "Drift", "Model gap"]
 
 
 def list_pages(device: ViewerDeviceDescription, entities: set[str] | None = None) -> list[str]:
@@ -22,8 +29,10 @@ def list_origins(*devices: ViewerDeviceDescription, entities: set[str] | None = 
 
 
 def test_device_has_the_pages_of_its_features() -> None:
-    assert list_pages(ViewerDeviceDescription("a")) == PAGES[:2]
-    assert list_pages(ViewerDeviceDescription("a", has_thermal=True)) == PAGES[:3]
+    assert list_pages(ViewerDeviceDescription("a")) == PAGES[:3]
+    assert "/a/thermal/gx" not in list_origins(ViewerDeviceDescription("a"))
+    assert "/a/thermal/gx" in list_origins(ViewerDeviceDescription("a", has_thermal=True))
+    assert list_pages(ViewerDeviceDescription("a", compensated=True)) == PAGES[:4]
     assert list_pages(FULL) == PAGES
     several = blueprint([ViewerDeviceDescription("nose"), ViewerDeviceDescription("tail")]).root_container
     assert [page.name for page in several.contents] == ["Overview", "nose", "tail"]
@@ -37,7 +46,7 @@ def test_device_without_data_has_its_state_and_a_guide() -> None:
 def test_views_and_pages_appear_with_their_data() -> None:
     entities = {"/b/status", "/b/samples/gx", "/b/allan/gx", "/b/coefficients", "/b/coefficients/N/gx"}
     assert list_pages(FULL, entities) == ["Device", "What changed", "Model gap"]
-    assert list_pages(FULL, entities | {"/b/drift/gx"}) == PAGES
+    assert list_pages(FULL, entities | {"/b/drift/gx", "/b/temperature"}) == PAGES
     origins = list_origins(FULL, entities=entities)
     assert {"/b/allan", "/b/samples", "/b/coefficients/N"} <= set(origins)
     assert not {"/b/temperature", "/b/gap", "/b/events", "/b/dynamic/gx", "/b/coefficients/B"} & set(origins)
@@ -60,8 +69,18 @@ def test_every_panel_has_one_sentence() -> None:
 
 def test_guide_describes_only_the_panels_of_its_page() -> None:
     texts = guide_texts(blueprint([FULL]).root_container)
-    assert sorted(texts) == [f"b/guide/{page}" for page in ("changes", "gap", "now", "temperature")]
+    pages = ("DriftPanel", "ThermalPredictionPanel", "changes", "gap", "now")
+    assert sorted(texts) == [f"b/guide/{page}" for page in pages]
     assert "Heat maps" in texts["b/guide/changes"]
     assert "Heat maps" not in texts["b/guide/now"]
-    drift = guide_texts(blueprint([ViewerDeviceDescription("b", compensated=True)]).root_container)
-    assert "Temperature" not in drift["b/guide/temperature"]
+    assert "Temperature" in texts["b/guide/ThermalPredictionPanel"]
+    assert "Temperature" not in texts["b/guide/DriftPanel"]
+
+
+@pytest.mark.parametrize("count", [2, 3, 12])
+def test_overview_has_one_plot_of_each_kind_per_device(count: int) -> None:
+    layout = blueprint([ViewerDeviceDescription(f"d{i}") for i in range(count)]).root_container.contents[0]
+    plots = [view for view in list_views(layout) if str(view.origin).endswith("/allan")]
+    assert [view.name for view in plots] == [f"d{i}" for i in range(count)] * 2
+    legends = [view for view in plots if not any("legend" in one and one.startswith("-") for one in view.contents)]
+    assert len(legends) == (2 * count if count <= MAX_DEVICES_WITH_LEGEND else 0)

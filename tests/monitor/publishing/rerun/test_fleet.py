@@ -176,5 +176,6 @@ def test_table_shows_problems_first_and_escapes_texts() -> None:
     table = [line for line in lines if line.startswith("|")]
     assert table[2].startswith("| **imu/bad** | **LOST** |")
     assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
-    assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
+    assert r"- **imu/bad**: gone \| \<img src=x\> \[a\](http://b)  \# head" in lines
+    assert not [line for line in lines if line.startswith("- **imu/well**")]
     assert "… and 1 more with fewer problems" in fleet_text(registry.devices_with_problems_first(10.0), 10.0, 1)

@@ -90,7 +90,7 @@ def test_recording_contains_the_shown_results(tmp_path: Path) -> None:
     assert n == pytest.approx(np.degrees([c.value[1, 0], c.lo[1, 0], c.hi[1, 0]]) * 60)
     deviation = read_column_values(rows["/bench-1/allan/az"], "deviation")
     assert deviation == pytest.approx(np.sqrt(estimate.curve.avar[:, 5]))
-    assert "08:53:21  gz angle random walk rose by 47 %" in str(rows["/bench-1/events"])
+    assert "- **10-09 08:53:21 WARN** gz angle random walk rose by 47 %" in str(rows["/bench-1/events"])
     assert "RUNNING" in str(rows["/bench-1/status"])
     times = read_column_values(rows["/bench-1/samples/ax"], "sample_time")
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)

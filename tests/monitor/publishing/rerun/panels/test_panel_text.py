@@ -3,7 +3,7 @@
 import pytest
 
 from monitor.common.unit_formatting import KINDS, UNIT_SYSTEMS, format_number
-from monitor.publishing.rerun.panels.panel_text import health_text, noise_text, overview_text
+from monitor.publishing.rerun.panels.panel_text import events_text, health_text, noise_text, overview_text
 from tests.monitor.publishing import example_results
 
 
@@ -27,13 +27,14 @@ def test_each_coefficient_has_its_unit():
     for unit in ("µrad", "°/√h", "°/h/√h", "°/h/h", "µm/s", "m/s/√h", "µg/√h", "µg/h"):
         assert unit in text
     assert "≤ 2.23" in text  # this is R, 3e-9 rad/s², in °/h/h
-    assert "gx | gy | gz" in text
+    assert "**gx** | **gy** | **gz**" in text
 
 
 @pytest.mark.parametrize("name", UNIT_SYSTEMS)
 def test_tables_have_the_chosen_units(name: str) -> None:
     estimate, units = example_results.make_estimate(), UNIT_SYSTEMS[name]
-    rows = [line.split(" | ") for line in noise_text(estimate, units).splitlines() if line.startswith("| **")]
+    lines = [line for line in noise_text(estimate, units).splitlines() if line.startswith("| **")]
+    rows = [line.split(" | ") for line in lines if "**gx**" not in line and "**ax**" not in line]
     columns = [(kind, column) for kind in KINDS for column in units.columns(kind)]
     assert [row[0] for row in rows] == [f"| **{one.symbol}** {one.unit.name}" for _, one in columns]
     n = [
@@ -41,7 +42,7 @@ def test_tables_have_the_chosen_units(name: str) -> None:
         for row, (kind, one) in zip(rows, columns, strict=True)
         if (kind, one.symbol) == ("gyro", "N")
     ]
-    assert [text for text, _ in n] == [
+    assert [text.split(" ")[0] for text, _ in n] == [
         f"**{format_number(unit.factor * estimate.coefficients.value[1, 0])}**" for _, unit in n
     ]
     assert len(n) == (2 if name == "datasheet" else 1)
@@ -65,6 +66,7 @@ def test_overview_has_one_line_per_device():
     text = overview_text(
         {"a": example_results.make_health(), "b": example_results.make_health(state="waiting", rate_hz=None)}
     )
+    assert text.startswith("no problem\n")
     assert "| **a** | running | 99.98 Hz |" in text
     assert "| **b** | waiting | — |" in text
 
@@ -72,3 +74,25 @@ def test_overview_has_one_line_per_device():
 def test_exceeded_limit_is_in_the_health_panel() -> None:
     assert "limits exceeded: **gz N, az B**" in health_text("b", example_results.make_health(crossed=("gz N", "az B")))
     assert "limit" not in health_text("b", example_results.make_health())
+
+
+def test_overview_lists_problems_above_the_table() -> None:
+    text = overview_text({f"d{i}": example_results.make_health(text=f"port {i} is gone") for i in range(8)})
+    assert text.splitlines()[:2] == ["- **d0**: port 0 is gone", "- **d1**: port 1 is gone"]
+    assert "… and 2 more problems" in text
+    assert text.index("more problems") < text.index("| device |")
+
+
+def test_interval_is_in_percent_of_the_value() -> None:
+    estimate = example_results.make_estimate()
+    c = estimate.coefficients
+    c.lo[1, 0], c.hi[1, 0] = 0.996 * c.value[1, 0], 1.004 * c.value[1, 0]
+    c.lo[1, 1], c.hi[1, 1] = 0.79 * c.value[1, 1], 1.24 * c.value[1, 1]
+    (row,) = [line for line in noise_text(estimate).splitlines() if line.startswith("| **N** °/√h")]
+    assert "** ±0.4 % | " in row
+    assert "** −21 +24 % | " in row
+
+
+def test_events_are_listed_with_the_newest_first() -> None:
+    lines = [(1.76e9, "", "back"), (1.76e9 + 86_400.0, "ERROR", "gone")]
+    assert events_text(lines) == "- **10-10 08:53:20 ERROR** gone\n- 10-09 08:53:20 back"
