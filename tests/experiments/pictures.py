@@ -13,6 +13,7 @@ import argparse
 import base64
 import contextlib
 import io
+import itertools
 import json
 import os
 import secrets
@@ -28,7 +29,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 from urllib.parse import quote
 
 import numpy as np
@@ -52,6 +55,7 @@ from monitor.publishing.rerun.viewer_settings_and_errors import ViewerDeviceDesc
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
+from monitor.simulator import ports
 from monitor.simulator.demo_config import build_demo_config
 from monitor.simulator.encoding_sensor import AMBIENT_C, WARM_UP_C, WARM_UP_S
 from tests.experiments.picture_sources import store_checksum
@@ -176,7 +180,7 @@ def surfaces(out: Path, folder: Path) -> Path:
 def gap(out: Path, folder: Path) -> Path:
     """Show the "Model gap" page for a device whose noise has changed."""
     devices = f'{replay(folder, changed=True)}model = "{MODEL}"\n'
-    return show_changed_device(out / "viewer-gap.png", devices, folder, tab=3)
+    return show_changed_device(out / "viewer-gap.png", devices, folder, tab=4)
 
 
 def show_changed_device(path: Path, devices: str, folder: Path, tab: int) -> Path:
@@ -191,7 +195,7 @@ def show_changed_device(path: Path, devices: str, folder: Path, tab: int) -> Pat
 
 
 def temperature(out: Path, folder: Path) -> Path:
-    """Show the "Temperature and drift" page for two days of data in which the bias of gz stepped once."""
+    """Show the "Temperature" page for two days of data in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
     model = read_model(shipped_config_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
@@ -209,7 +213,7 @@ def temperature(out: Path, folder: Path) -> Path:
 
 
 def drift(out: Path, folder: Path) -> Path:
-    """Show the page "Temperature and drift" for a sensor that is turned three times."""
+    """Show the page "Drift" for a sensor that is turned three times."""
     path = out / "viewer-drift.png"
     source = folder / "turned.npz"
     n = round(TURNED_RECORDING_S * 100.0)
@@ -229,7 +233,7 @@ def drift(out: Path, folder: Path) -> Path:
     with window() as (port, shoot):
         with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
             wait_until(lambda: has_replayed(service, TURNED_RECORDING_S - 2.0), 120.0)
-        select_tab(port, 2)
+        select_tab(port, 3)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
@@ -267,7 +271,7 @@ def select_tab(port: int, tab: int) -> None:
 def fleet(out: Path, folder: Path) -> Path:
     """Show the overview of three devices."""
     path = out / "viewer-fleet.png"
-    with window() as (port, shoot), serving(folder, FLEET, port) as service:
+    with window() as (port, shoot), short_port_names(folder), serving(folder, FLEET, port) as service:
         simulated = {worker.name: worker.simulated for worker in service.workers}
         tail, wing = simulated["tail"], simulated["wing"]
         wait_until(lambda: all(worker.publisher.latest is not None for worker in service.workers), 120.0)
@@ -286,7 +290,7 @@ def fleet(out: Path, folder: Path) -> Path:
 def view(out: Path, folder: Path) -> Path:
     """Show ``imu-monitor view`` with twelve devices; one of three daemons is stopped, and two cables are unplugged."""
     path = out / "view-fleet.png"
-    with window() as (port, shoot), contextlib.ExitStack() as stack:
+    with window() as (port, shoot), short_port_names(folder), contextlib.ExitStack() as stack:
         daemons, endpoints = [], []
         for daemon in range(3):
             endpoints.append(f"tcp/127.0.0.1:{free_port()}")
@@ -583,6 +587,20 @@ def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
     path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
     with running(loading.load_config(path)) as service:
         yield service
+
+
+@contextmanager
+def short_port_names(folder: Path) -> Iterator[None]:
+    """Give the pseudo-terminals of simulated sensors short relative paths below ``folder``, which messages show."""
+    numbers = itertools.count()
+
+    def create_folder(prefix: str) -> str:
+        name = Path(f"usb{next(numbers)}")
+        name.mkdir()
+        return str(name)
+
+    with contextlib.chdir(folder), mock.patch.object(ports, "tempfile", SimpleNamespace(mkdtemp=create_folder)):
+        yield
 
 
 @contextmanager

@@ -33,8 +33,8 @@ from monitor.publishing.remote_device_states import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose angle random walk N is shown in the table of all devices."""
-MAX_SHOWN_PROBLEMS: Final = 6
-"""Largest number of problems above the table of all devices."""
+MAX_SHOWN_PROBLEMS: Final = 4
+"""Largest number of different problems above the table of all devices."""
 PROGRESS_BAR: Final = re.compile(" ?[█░]+")
 LINE_BREAK: Final = "  \n"
 """Line break of Markdown, which needs less space than a new paragraph."""
@@ -86,14 +86,17 @@ def overview_text(healths: Mapping[str, Health]) -> str:
         for name, h in healths.items()
     ]
     head = "| device | state | rate | received | lost | bad |\n|:--|:--|--:|--:|--:|--:|"
-    return "\n".join([*_problem_list(problems), head, *rows])
+    return "\n".join([*(_problem_list(problems) if problems else ["no problem", ""]), head, *rows])
 
 
 def _problem_list(problems: Sequence[tuple[str, str]]) -> list[str]:
     """Return Markdown lines with the problems of devices, because the cells of a table do not wrap long texts."""
-    lines = [f"- **{name}**: {text}" for name, text in problems[:MAX_SHOWN_PROBLEMS]]
-    lines += [f"- … and {len(problems) - len(lines):,} more problems"] if len(problems) > len(lines) else []
-    return [*(lines or ["no problem"]), ""]
+    devices: dict[str, list[str]] = {}  # by problem
+    for name, text in problems:
+        devices.setdefault(text, []).append(name)
+    lines = [f"- **{', '.join(names)}**: {text}" for text, names in devices.items()]
+    more = len(lines) - MAX_SHOWN_PROBLEMS
+    return [*lines[:MAX_SHOWN_PROBLEMS], *([f"- … and {more:,} more problems"] if more > 0 else []), ""]
 
 
 def fleet_text(
@@ -119,13 +122,13 @@ def fleet_text(
     unit = units.single("gyro", "N")
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head[0] += f"; N in {unit.name}" if devices else ""
-    head += [f"**{remove_control_characters(note)}**"] if note else []
+    head[0] += f"{LINE_BREAK}**{remove_control_characters(note)}**" if note else ""
     table = [_fleet_row(one, now_s, unit) for one in devices[:rows]]
     if table:
         columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES)]
         table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 2), *table]
     found = ((escape_markdown(one.key), _fleet_problem(one, now_s)) for one in devices)
-    problems = _problem_list([(name, text) for name, text in found if text]) if table else []
+    problems = _problem_list([(name, text) for name, text in found if text])
     left = [f"… and {len(devices) - rows:,} more with fewer problems"] if len(devices) > rows else []
     return "\n\n".join([*head, *(["\n".join([*problems, *table])] if table else []), *left])
 

@@ -170,7 +170,7 @@ def test_table_shows_problems_first_and_escapes_texts() -> None:
             CoefficientsMessage.from_result(device, 1.0, 0, example_results.make_estimate()).encode(),
         )
     text = fleet_text(registry.devices_with_problems_first(10.0), 10.0, 40, "1 of 2 there")
-    lines = text.splitlines()
+    lines = [line.rstrip() for line in text.splitlines()]
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
     assert "**1 of 2 there**" in lines
     table = [line for line in lines if line.startswith("|")]

@@ -77,8 +77,8 @@ def test_exceeded_limit_is_in_the_health_panel() -> None:
 
 
 def test_overview_lists_problems_above_the_table() -> None:
-    text = overview_text({f"d{i}": example_results.make_health(text=f"port {i} is gone") for i in range(8)})
-    assert text.splitlines()[:2] == ["- **d0**: port 0 is gone", "- **d1**: port 1 is gone"]
+    text = overview_text({f"d{i}": example_results.make_health(text=f"port {i // 2} is gone") for i in range(12)})
+    assert text.splitlines()[:2] == ["- **d0, d1**: port 0 is gone", "- **d2, d3**: port 1 is gone"]
     assert "… and 2 more problems" in text
     assert text.index("more problems") < text.index("| device |")
 
