@@ -233,7 +233,7 @@ def drift(out: Path, folder: Path) -> Path:
     with window() as (port, shoot):
         with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
             wait_until(lambda: has_replayed(service, TURNED_RECORDING_S - 2.0), 120.0)
-        select_tab(port, 3)
+        select_tab(port, 2)  # the recording has no temperature, so there is no page for it
         time.sleep(SETTLE_S)
         shoot(path)
     return path

@@ -81,8 +81,9 @@ def health_text(device: str, health: Health, about: str = "") -> str:
 def overview_text(healths: Mapping[str, Health]) -> str:
     """Return the problems of several devices, and a Markdown table with one line for each device."""
     problems = [(escape_markdown(name), escape_markdown(h.text)) for name, h in healths.items() if h.text]
+    states = {name: f"**{h.state.upper()}**" if h.state == "lost" else h.state for name, h in healths.items()}
     rows = [
-        f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} |"
+        f"| **{name}** | {states[name]} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} |"
         for name, h in healths.items()
     ]
     head = "| device | state | rate | received | lost | bad |\n|:--|:--|--:|--:|--:|--:|"

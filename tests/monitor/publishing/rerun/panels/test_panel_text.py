@@ -69,6 +69,7 @@ def test_overview_has_one_line_per_device():
     assert text.startswith("no problem\n")
     assert "| **a** | running | 99.98 Hz |" in text
     assert "| **b** | waiting | — |" in text
+    assert "| **c** | **LOST** | — |" in overview_text({"c": example_results.make_health(state="lost", rate_hz=None)})
 
 
 def test_exceeded_limit_is_in_the_health_panel() -> None:
