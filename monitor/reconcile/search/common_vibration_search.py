@@ -314,8 +314,18 @@ def build_cross_spectra(
         weight = np.interp(bins.f_hz, whole.f_hz, one.weights[whole.first])
         deviation.append(1.0 / np.maximum(weight, 1e-150))
     products = np.array([[bins.sum_over_bins(x * y) for y in flat] for x in flat])
+    products = _limited_by_power(products, bins.count)
     known = _known_correlations(whitened, np.array(deviation), bins)
     return CrossSpectra(bins, np.array(deviation), products, known, _pairs_without_leak(whitened))
+
+
+def _limited_by_power(products: Floats, count: Floats) -> Floats:
+    """Divide the products [d, d, m] by the power of both axes in the bin, where this power exceeds the smoothed power.
+
+    Without this division, a bin with a few large coefficients would have an unlimited log-likelihood gain.
+    """
+    power = np.einsum("xxm->xm", products)
+    return np.asarray(products * count / np.maximum(count, np.sqrt(power[:, None] * power[None])))
 
 
 def _pairs_without_leak(whitened: Sequence[WhitenedAxis]) -> Floats:

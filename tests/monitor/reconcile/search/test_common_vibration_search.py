@@ -158,3 +158,11 @@ def test_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
     joint = _fit_gains_with_spectra(spectra, vibration, hypotheses)
     left = _without_weak_axes(joint, spectra, _cross_spectra_of_halves(joint, whitened, [shape]))
     assert (left.vibration.gains != 0.0).tolist() == [True, True, shared == "whole"]
+
+
+def test_single_large_coefficient_is_no_common_vibration():
+    k = np.arange(n)
+    cosine = np.cos(np.pi * (k + 0.5) * 10_000 / n) * np.sqrt(2.0 / n)  # one row of the cosine transform
+    size = {"gx": 3.0, "gy": 6.6, "gz": 0.0}
+    values = {name: y + size[name] * N * 10.0 * cosine for name, y in draw_noise(3).items()}
+    assert not list_vibrations(search_all_axes(values))
