@@ -3,7 +3,7 @@
 Each reader checks the number of samples before allocating memory. Checking the file size is not sufficient, because a
 compressed file of a few megabytes can unpack to gigabytes.
 
-Four limits apply (docs/how-to/recording.md):
+Four limits apply (docs/reference/limits.md):
 
 - The samples and the copies made during an analysis must fit into the available memory.
 - A file contains at most ``MIN_ROW_LIMIT`` rows or ``MAX_ROWS_PER_BYTE`` rows per byte on disk, whichever is more.

@@ -186,27 +186,30 @@ def count(cell: str, seconds: int, seed: int, chunk: int) -> Chunk:
 
 
 def tables(chunks: list[Chunk]) -> str:
-    """Return the table in Markdown."""
-    rows = [row for group in group_chunks(chunks).items() for row in _rows(*group)]
-    return format_table(("record", "noise", "estimator", "Q", "N", "B", "K"), rows)
+    """Return a table in Markdown with a row for each length and estimator, and a column for each noise."""
+    figures: dict[tuple[str, str], dict[str, str]] = {}
+    for (seconds, cell), group in group_chunks(chunks).items():
+        for name, text in _figures(seconds, cell, group).items():
+            figures.setdefault((format_length(seconds), name), {})[cell] = text
+    cells = [cell for cell in CELLS if any(cell in row for row in figures.values())]
+    rows = [(*key, *(row.get(cell, "") for cell in cells)) for key, row in figures.items()]
+    return "Each cell gives the figures of Q, N, B and K.\n\n" + format_table(("record", "estimator", *cells), rows)
 
 
-def _rows(key: tuple[int, str], group: list[Chunk]) -> list[tuple[str, ...]]:
-    seconds, cell = key
+def _figures(seconds: int, cell: str, group: list[Chunk]) -> dict[str, str]:
+    """Return the Cramér–Rao limits and the ratio of each estimator to them, for Q, N, B and K."""
     limits = cramer_rao(CELLS[cell], round(seconds * RATE_HZ))
-    limit_cells = [f"{100 * limits[letter]:.3g} %" for letter in "QNBK"]
-    rows: list[tuple[str, ...]] = [(format_length(seconds), cell, "*limit*", *limit_cells)]
+    texts = {"*limit*, %": ", ".join(f"{100 * limits[letter]:.3g}" for letter in "QNBK")}
     for name in dict.fromkeys(name for chunk in group for name in chunk["errors"]):
         # the first chunks may lack estimators that were added later
         chunks_with_name = [chunk for chunk in group if name in chunk["errors"]]
         records = sum(chunk["records"] for chunk in chunks_with_name)
         sums = np.sum([np.array(chunk["errors"][name], float) for chunk in chunks_with_name], axis=0)
-        figures = [
+        texts[name] = ", ".join(
             _ratio(limits[c], sums[1:, k] / records, records, TARGETS.get(name, {}).get(c))
             for k, c in enumerate("QNBK")
-        ]
-        rows.append((format_length(seconds), cell, name, *figures))
-    return rows
+        )
+    return texts
 
 
 def _ratio(limit: float, moments: Floats, records: int, target: float | None) -> str:

@@ -29,13 +29,13 @@ def test_page_has_every_effect_and_the_order_of_the_transforms():
 def test_section_agrees_with_the_code(name):
     section = SECTIONS[name]
     assert section.strip().startswith(EFFECTS[name].description)
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section, flags=re.MULTILINE))
+    rows = dict(re.findall(r"^- `(\w+)` \[([^\]]+)\]: ", section, flags=re.MULTILINE))
     assert list(rows) == [f.name for f in fields(EFFECTS[name])]
     for f in fields(EFFECTS[name]):
         assert rows[f.name] == " / ".join(dict.fromkeys(f.metadata["units"]))
         assert ("may be absent" in section) == any(g.metadata.get("optional", False) for g in fields(EFFECTS[name]))
     properties = (r"σ²\(τ\)", r"S\(f\)", "source")
-    assert all(re.search(rf"^\| {what} \| [^|]*\w[^|]* \|$", section, flags=re.MULTILINE) for what in properties)
+    assert all(re.search(rf"^- {what}: .*\w", section, flags=re.MULTILINE) for what in properties)
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,9 @@ def test_section_agrees_with_the_code(name):
 )  # whether these are NaN depends on their parameters
 def test_page_states_nan_where_the_code_returns_nan(name):
     value = make_model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
-    assert ("| σ²(τ) | NaN |" in SECTIONS[name]) == bool(np.isnan(value))
+    assert ("- σ²(τ): NaN\n" in SECTIONS[name]) == bool(np.isnan(value))
 
 
 def test_page_describes_the_temperature():
-    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE))
+    rows = dict(re.findall(r"^- `(\w+)` \[([^\]]+)\]: ", SECTIONS["temperature"], flags=re.MULTILINE))
     assert rows == {name: unit for name, (unit, _) in gyro_and_accel_units(Temperature).items()}
