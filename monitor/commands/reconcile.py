@@ -1,8 +1,8 @@
 """Command ``reconcile``: compares recordings with a noise model and writes the report.
 
-The report consists of ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. If the data do not
-support an answer, only ``report.json`` is written, with the reason. If several recordings are compared, the report of
-each recording is written to a subfolder.
+The report consists of ``report.html``, ``report.json``, ``model.toml`` and, if an axis differs from the model,
+``reconcile.rrd``. If the data do not support an answer, only ``report.json`` is written, with the reason. If several
+recordings are compared, the report of each recording is written to a subfolder.
 """
 
 import os
@@ -235,7 +235,9 @@ def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
 
 
 def write_report(result: Reconciliation, folder: Path, title: str, units: UnitSystem = DEFAULT_UNITS) -> None:
-    """Write ``report.json``, ``model.toml``, ``report.html`` and, if Rerun is installed, ``reconcile.rrd``.
+    """Write ``report.json``, ``model.toml``, ``report.html`` and, if an axis differs from the model, ``reconcile.rrd``.
+
+    Without Rerun, ``reconcile.rrd`` is not written. The file of an earlier comparison is removed.
 
     Parameters
     ----------
@@ -258,11 +260,15 @@ def write_report(result: Reconciliation, folder: Path, title: str, units: UnitSy
     _write(folder / REPORT, encode_report(result))
     _write(folder / "model.toml", result.model.to_toml().encode())
     _write(folder / "report.html", render_page(result, title, units).encode())
+    path = folder / "reconcile.rrd"
+    path.unlink(missing_ok=True)
+    if result.verdict == "agrees":  # the curves are in report.html, and there are no steps
+        return
     try:
         from monitor.publishing.reports.reconcile_rrd import write_rrd
     except ImportError:  # the library of the viewer is optional
         return
-    with atomic_write_path(folder / "reconcile.rrd") as place:
+    with atomic_write_path(path) as place:
         write_rrd(result, place, units)
 
 

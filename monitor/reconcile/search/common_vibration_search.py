@@ -57,6 +57,8 @@ MAX_LOG_GAIN_CHANGE: Final = 1.5
 """Largest change of the logarithm of a gain in one sweep of the fit."""
 MAX_LOG_BANDWIDTH_CHANGE: Final = 1.0
 """Largest change of the logarithm of a bandwidth relative to the first search."""
+MIN_FIRST_GAIN_SHARE: Final = 0.5
+"""Smallest gain in the first search relative to the penalty. A finer bandwidth does not double the gain."""
 MIN_HALF_SHARE: Final = 0.2
 """Smallest share of the gain that each half of the recording must contribute, for all axes together and for each
 axis."""
@@ -406,12 +408,14 @@ def fit_correlations(spectra: CrossSpectra, shape: Shape) -> _Vibration:
 
 
 def _fit_shape(spectra: CrossSpectra, shapes: Sequence[Shape]) -> _Vibration:
-    """Return the strongest vibration with a fitted bandwidth."""
+    """Return the strongest vibration. The bandwidth is fitted if the vibration can be significant."""
     found = []
     for resonance in (False, True):
         fits = [fit_correlations(spectra, shape) for shape in shapes if (shape[0] is not None) == resonance]
         if fits:
-            found.append(_with_fitted_bandwidth(spectra, max(fits, key=lambda one: one.gain_nats)))
+            best = max(fits, key=lambda one: one.gain_nats)
+            possible = best.gain_nats > MIN_FIRST_GAIN_SHARE * best.penalty_nats
+            found.append(_with_fitted_bandwidth(spectra, best) if possible else best)
     return max(found, key=lambda one: one.gain_nats - one.penalty_nats)
 
 

@@ -13,10 +13,11 @@ import pytest
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
 from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import compare_recordings, unique_recording_names
+from monitor.commands.reconcile import compare_recordings, unique_recording_names, write_report
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
+from tests.monitor.reconcile import samples
 
 pytest.importorskip("jinja2")
 
@@ -105,6 +106,14 @@ def test_every_recording_has_its_own_report(reconciled_folder_and_output: tuple[
         assert {*REPORT_FILES} <= {path.name for path in (folder / run).iterdir()}
         assert read_report(folder / run)["schema"] == "imu-monitor/reconcile/1"
         assert f'href="{run}/report.html"' in (folder / "report.html").read_text()
+
+
+def test_curves_for_rerun_are_written_only_for_a_difference(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    write_report(samples.explained(), tmp_path, "first")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["reconcile.rrd", *REPORT_FILES])
+    write_report(samples.agrees(), tmp_path, "second")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(REPORT_FILES)
 
 
 def test_printed_summary_agrees_with_the_report(reconciled_folder_and_output: tuple[Path, str]) -> None:
