@@ -30,6 +30,7 @@ from monitor.reconcile.result import (
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
+from monitor.reconcile.search.withdrawal_of_contradicted_effects import OSCILLATIONS, share_of_frequencies_covered
 from monitor.reconcile.summary.effect_contributions import (
     compute_allan_influences_of_changes,
     decompose_explained_gain,
@@ -39,6 +40,14 @@ from monitor.reconcile.summary.effect_contributions import (
 MAX_RUNNERS_UP: Final = 3
 MAX_FREQUENCY_DIFFERENCE: Final = 0.05
 """Largest relative difference of the frequencies of two candidates for the same oscillation."""
+MIN_COVERED_SHARE: Final = 0.25
+"""Smallest share of the frequencies of a remaining difference that an oscillation of the wrong shape covers."""
+MAX_CONFIDENCE_OF_WRONG_SHAPE: Final = 0.5
+"""Largest confidence of an oscillation if a significant difference remains at its frequency. The spectrum then has
+another shape. This value is empirical: the trials contain such oscillations only for unknown effects."""
+WRONG_SHAPE_TEXT: Final = (
+    "A difference remains at its frequency, so the effect describes the spectrum only approximately."
+)
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
@@ -67,12 +76,15 @@ def build_axis_result(
     influences = (
         compute_allan_influences_of_changes(search.hypothesis, {index for _, index, _ in changes}) if changes else {}
     )
+    left_over = tuple(gap for gap in end.gaps if gap.is_significant)
     steps = []
     for at, index, kind in changes:
         before = snapshots[0 if search.rounds[at].replaces_effects else at]
         step = _describe_step(search, search.rounds[at], index, kind, before, snapshots[at + 1])
+        if kind == "added" and _has_remaining_difference(search.hypothesis.effects[index], left_over):
+            confidence = min(step.confidence, MAX_CONFIDENCE_OF_WRONG_SHAPE)
+            step = replace(step, confidence=confidence, because=f"{step.because} {WRONG_SHAPE_TEXT}")
         steps.append(replace(step, gain_nats=gains.get(index, 0.0), allan=influences[index]))
-    left_over = tuple(gap for gap in end.gaps if gap.is_significant)
     decision = _axis_decision(bool(steps), bool(left_over))
     remaining = measure_remaining_gaps(search, left_over)
     return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
@@ -171,6 +183,12 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
     return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
 
 
+def _has_remaining_difference(effect: Effect, left_over: tuple[DiagnosticGap, ...]) -> bool:
+    """Return True if a difference in the spectrum remains mainly at the frequency of an oscillation."""
+    places = (gap.where.frequency for gap in left_over if gap.diagnostic in ("psd", "lines"))
+    return any(place and share_of_frequencies_covered(effect, place) > MIN_COVERED_SHARE for place in places)
+
+
 def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Trial, ...]) -> tuple[Trial, ...]:
     """Return the selected trial and its alternatives, without effects that were added in other rounds.
 
@@ -184,8 +202,8 @@ def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Tria
 
 
 def _is_same_effect(one: Effect | None, other: Effect) -> bool:
-    """Return True if both effects have the same type and, if they are oscillations, nearly the same frequency."""
-    if type(one) is not type(other):
+    """Return True if both effects have the same type, or are oscillations with nearly the same frequency."""
+    if type(one) is not type(other) and not (isinstance(one, OSCILLATIONS) and isinstance(other, OSCILLATIONS)):
         return False
     hz, other_hz = getattr(one, "frequency", None), getattr(other, "frequency", None)
     return not (hz and other_hz) or abs(log(hz / other_hz)) < MAX_FREQUENCY_DIFFERENCE

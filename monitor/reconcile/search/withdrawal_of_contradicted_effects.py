@@ -61,6 +61,7 @@ MAX_REMAINING_LEAK_SHARE: Final = 0.5
 MAX_FOREIGN_RATIO: Final = 100.0
 """Largest gain of the non-spectral diagnostics, relative to the gain that a smooth spectrum should explain."""
 PEAKS: Final = (Narrowband, Sinusoidal)
+OSCILLATIONS: Final = (*PEAKS, WanderingLine)
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated, PowerLaw)
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
 """Diagnostics of non-Gaussian, non-stationary or common noise."""
@@ -150,6 +151,22 @@ def _resolved_frequency(diagnostic: str, finding: WhitenessDeparture, rate_hz: f
     place = finding.where.frequency
     is_wide = place is not None and np.ptp(place) >= MAX_BAND_FRACTION * rate_hz
     return None if diagnostic == "spectrogram" and is_wide else place
+
+
+def share_of_frequencies_covered(effect: Effect, place: tuple[float, float]) -> float:
+    """Return the share of a frequency range that a line, wandering line or resonance covers. It is 0 for other effects.
+
+    Examples
+    --------
+    >>> share_of_frequencies_covered(Narrowband(sigma=1.0, frequency=10.0, bandwidth=2.0), (11.0, 15.0))
+    0.25
+    """
+    if not isinstance(effect, OSCILLATIONS):
+        return 0.0
+    lo, hi = _frequency_range(effect)
+    if place[0] == place[1]:
+        return float(lo < place[0] < hi)
+    return max(min(hi, place[1]) - max(lo, place[0]), 0.0) / (place[1] - place[0])
 
 
 def _frequency_range(effect: Effect) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from monitor.noise.effects import Narrowband
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.axis_result_builder import build_axis_result
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
@@ -42,6 +43,13 @@ def draw_noise(seed=0):
     return white(n, rng) + walk(n, rng)
 
 
+def steep_resonance(size, rng, sigma, frequency_hz, half_width_hz):
+    """Noise with the cube of the spectrum of a resonance."""
+    spectrum, f = np.fft.rfft(rng.standard_normal(size)), np.fft.rfftfreq(size, 1.0 / RATE_HZ)
+    series = np.fft.irfft(spectrum * (1.0 + ((f - frequency_hz) / half_width_hz) ** 2) ** -1.5, size)
+    return sigma * series / series.std()
+
+
 def make_hidden_effect(name):
     rng = np.random.default_rng(1)
     return {
@@ -52,6 +60,7 @@ def make_hidden_effect(name):
         "line and outliers": draw_noise() + LINE + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
         "clustered outliers": draw_noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
         "correlated": draw_noise() + correlated(n, rng, 3e-4, 0.5),
+        "steep resonance": draw_noise() + steep_resonance(n, np.random.default_rng(1), 1e-3, 17.0, 2.0),
         "filtered and coarse": 4e-4 * np.rint(draw_noise() / 4e-4),
     }[name]
 
@@ -164,6 +173,29 @@ def test_effect_that_is_added_too_does_not_reduce_the_confidence():
         steps = build_axis_result(replace(search, rounds=tuple(rounds)), STRICT, STRICT).steps
         (line,) = (one for one in steps if one.effect == "sinusoidal")
         assert line.confidence == pytest.approx(confidence, abs=0.01)
+
+
+def test_rejected_candidate_for_an_added_oscillation_does_not_reduce_the_confidence():
+    search = search_effect("line and outliers")
+    rounds = list(search.rounds)
+    at = next(k for k, one in enumerate(rounds) if one.trials[0].name == "outliers")
+    selected = rounds[at].trials[0]
+    for frequency_hz, confidence in ((17.5, 1.0), (25.0, 0.5)):
+        rival = Trial("narrowband", Narrowband(sigma=1e-4, frequency=frequency_hz, bandwidth=0.1), selected.score)
+        rounds[at] = replace(rounds[at], trials=(selected, rival))
+        steps = build_axis_result(replace(search, rounds=tuple(rounds)), STRICT, STRICT).steps
+        (outliers,) = (one for one in steps if one.effect == "outliers")
+        assert outliers.confidence == pytest.approx(confidence, abs=0.01)
+
+
+def test_resonance_beside_a_remaining_difference_is_not_certain():
+    result = describe_effect("steep resonance")
+    assert result.verdict == "partly_explained"
+    (resonance,) = (step for step in result.steps if step.effect == "narrowband")
+    assert resonance.confidence <= 0.5
+    assert "only approximately" in resonance.because
+    (line,) = describe_effect("line").steps
+    assert "only approximately" not in line.because
 
 
 def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():
