@@ -68,6 +68,7 @@ def render_page(r: Reconciliation, title: str = "", units: UnitSystem = DEFAULT_
         "reconcile.html.j2",
         summary=summarize(r),
         ranking=ranking,
+        main=summary_sentences.main_findings(ranking),
         summary_words=summary_sentences,
         allan_figures=draw_differing_allan_deviations(r, ranking, units),
         title=title or "Recording",

@@ -128,10 +128,12 @@ def _without_unneeded_effects(hypothesis: Hypothesis, others: Sequence[Effect]) 
     while True:
         best: tuple[float, Hypothesis] | None = None
         for at, effect in enumerate(hypothesis.added):
-            removable = effect.name in SIZE_PARAMETERS or isinstance(effect, BandwidthLimit)
+            removable = effect.name in SIZE_PARAMETERS or isinstance(effect, (BandwidthLimit, ScaleFactor))
             if not removable or isinstance(effect, KEPT_EFFECTS):
                 continue
             less = hypothesis.refit_with_other_added_effects(hypothesis.added[:at] + hypothesis.added[at + 1 :])
+            if isinstance(effect, ScaleFactor) and len(changed_sizes(less)) > len(changed_sizes(hypothesis)):
+                continue  # a factor is simpler than changed sizes
             shared = any(share_frequency_or_time(effect, other) for other in others)
             penalty = RESIZE_PENALTY_NATS if shared else PENALTY_NATS[effect.name]
             surplus = hypothesis.penalised_log_likelihood - less.penalised_log_likelihood - penalty

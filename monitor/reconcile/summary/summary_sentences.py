@@ -69,11 +69,22 @@ def summarize(r: Reconciliation) -> tuple[str, ...]:
     sentences = (
         _describe_faults(r),
         _describe_result(r, ranking),
-        _describe_findings(_main_findings(ranking), ranking),
+        _describe_findings(main_findings(ranking), ranking),
         _describe_remaining_gaps(ranking),
         _recommend(r, ranking),
     )
     return tuple(sentence for sentence in sentences if sentence)
+
+
+def main_findings(ranking: GapRanking) -> list[RankedGapCause]:
+    """Return the first findings that explain ``MAIN_SHARE`` of the explained gap, but at most ``MAX_LISTED``."""
+    aim = MAIN_SHARE * ranking.explained_share
+    listed: list[RankedGapCause] = []
+    for one in ranking.findings[:MAX_LISTED]:
+        if listed and sum(other.share for other in listed) >= aim:
+            break
+        listed.append(one)
+    return listed
 
 
 def _describe_faults(r: Reconciliation) -> str:
@@ -84,7 +95,7 @@ def _describe_faults(r: Reconciliation) -> str:
     for kind in kinds:
         axes = {axis for finding in r.recording_findings if finding.kind == kind for axis in finding.axes}
         texts.append(f"{kind.replace('_', ' ')}{_on_axes(axes)}")
-    return f"The recording has {_count(len(texts), 'fault')}: {', '.join(texts)}."
+    return f"The recording has {format_count(len(texts), 'fault')}: {', '.join(texts)}."
 
 
 def _describe_result(r: Reconciliation, ranking: GapRanking) -> str:
@@ -99,20 +110,9 @@ def _describe_result(r: Reconciliation, ranking: GapRanking) -> str:
     share = "all" if r.verdict == "explained" else format_share(ranking.explained_share)
     if not ranking.findings:
         return f"{head}, and other sizes of the model explain {share} of the difference."
-    return f"{head}, and {_count(len(ranking.findings), 'finding')} explain {share} of the difference.".replace(
+    return f"{head}, and {format_count(len(ranking.findings), 'finding')} explain {share} of the difference.".replace(
         "1 finding explain ", "1 finding explains "
     )
-
-
-def _main_findings(ranking: GapRanking) -> list[RankedGapCause]:
-    """Return the first findings that explain ``MAIN_SHARE`` of the explained gap."""
-    aim = MAIN_SHARE * ranking.explained_share
-    listed: list[RankedGapCause] = []
-    for one in ranking.findings[:MAX_LISTED]:
-        if listed and sum(other.share for other in listed) >= aim:
-            break
-        listed.append(one)
-    return listed
 
 
 def _describe_findings(listed: Sequence[RankedGapCause], ranking: GapRanking) -> str:
@@ -121,7 +121,7 @@ def _describe_findings(listed: Sequence[RankedGapCause], ranking: GapRanking) ->
     texts = [f"{describe_finding(one)} ({format_share(one.share)})" for one in listed]
     rest = ranking.findings[len(listed) :]
     if rest:
-        smaller = _count(len(rest), "smaller finding")
+        smaller = format_count(len(rest), "smaller finding")
         texts.append(f"{smaller} ({format_share(sum(one.share for one in rest))})")
     said = join_words(texts)
     return f"{said[0].upper()}{said[1:]}."
@@ -140,7 +140,7 @@ def describe_finding(finding: RankedGapCause) -> str:
             ("time", "at {:.5g} s"),
             ("correlation_time", "with a correlation time of {:.3g} s"),
             ("time_constant", "with a time constant of {:.3g} s"),
-            ("ratio", "of {:.6g}"),
+            ("ratio", "of {:.6g}" if finding.effect == "sample_rate_error" else "by a factor of {:.3g}"),
             ("factor", "of {:.4g}"),
         )
         if name in numbers
@@ -226,7 +226,12 @@ def _on_axes(axes: Sequence[str] | set[str]) -> str:
     return f" on {join_words(names)}" if names else ""
 
 
-def _count(number: int, noun: str) -> str:
+def format_count(number: int, noun: str) -> str:
+    """Return a number and a noun in the singular or plural.
+
+    >>> format_count(1, "axis fault"), format_count(2, "finding")
+    ('1 axis fault', '2 findings')
+    """
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 

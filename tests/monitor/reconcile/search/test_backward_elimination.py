@@ -10,6 +10,7 @@ from monitor.noise.effects import (
     AngleRandomWalk,
     ExponentiallyCorrelated,
     Narrowband,
+    NoiseStep,
     QuantizationNoise,
     RateRamp,
     ScaleFactor,
@@ -68,6 +69,23 @@ def test_effect_that_explains_nothing_is_removed():
 def test_effect_that_is_needed_stays():
     y = draw_noise() + draw_resonance(n, np.random.default_rng(3), 3e-4, 8.0, 0.5)
     assert list_added(eliminate_effects(y, (Narrowband(1e-4, 8.0, 0.5),))) == ["narrowband"]
+
+
+def test_factor_that_a_changed_size_cancels_is_removed():
+    step = NoiseStep(time=0.5 * n / 100.0, ratio=0.85)
+    rng = np.random.default_rng(0)
+    one = axis(white(n, rng) * np.where(step.time > T, 1.0, step.ratio) + walk(n, rng), (*MODEL, step))
+    before = fit_with_fewest_changes(one, (step, ScaleFactor(factor=0.92)), MODEL)
+    assert changed_sizes(before) == [0]  # N is larger, because the factor makes it too small
+    found = eliminate_unneeded_effects({"gz": make_found(before)}, {"gz": STRICT}, fitted_first=False)["gz"].hypothesis
+    assert list_added(found) == ["noise_step"]
+    assert changed_sizes(found) == []
+
+
+def test_factor_of_all_sizes_is_not_replaced_by_changed_sizes():
+    found = eliminate_effects(1.25 * draw_noise(), (ScaleFactor(factor=1.25),))
+    assert list_added(found) == ["scale_factor"]
+    assert changed_sizes(found) == []
 
 
 def test_two_peaks_of_one_resonance_become_one_resonance():
