@@ -41,8 +41,8 @@ from monitor.noise.effects.signal_chain.scale_factor import ScaleFactor as Scale
 from monitor.noise.effects.signal_chain.unit_error import UnitError as UnitError
 
 TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
-    ScaleFactor,
     BandwidthLimit,
+    ScaleFactor,
     SampleRateError,
     Saturation,
     Resolution,

@@ -248,20 +248,38 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
     """Propose a low-pass filter, if the current hypothesis contains none."""
     if BandwidthLimit in whitened.effect_types:
         return []
-    axis = whitened.axis
+    found = fit_low_pass(whitened.axis, whitened.effects)
+    return [] if found is None else [found]
+
+
+def fit_low_pass(axis: Axis, other_effects: Effects) -> BandwidthLimit | None:
+    """Fit a low-pass filter of each kind and order, and return the most likely filter.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    other_effects : tuple of Effect
+        Other effects of the axis.
+
+    Returns
+    -------
+    BandwidthLimit or None
+        Filter with the fitted cutoff. None if the cutoff is half the sample rate.
+    """
     nyquist = 0.5 * axis.rate_hz
     cutoffs = nyquist * np.geomspace(0.04, 0.95, 11)
     found: dict[BandwidthLimit, float] = {}
     for kind, order in FILTERS:
         floor = initial_effect_size(axis) / axis.rate_hz**0.5
         trials = [BandwidthLimit(cutoff=float(f), order=order, floor=floor, kind=kind) for f in cutoffs]
-        best = _most_likely(axis, whitened.effects, trials)
-        refined = fit_shape_parameter(axis, whitened.effects, best, "cutoff", 1.4)
+        best = _most_likely(axis, other_effects, trials)
+        refined = fit_shape_parameter(axis, other_effects, best, "cutoff", 1.4)
         assert isinstance(refined, BandwidthLimit)
         for one, penalty in ((refined, FLOOR_PENALTY_NATS), (replace(refined, floor=None), 0.0)):
             if one.cutoff < 0.99 * nyquist:
-                found[one] = axis.fit((*whitened.effects, one)).log_likelihood - penalty
-    return [max(found, key=lambda one: found[one])] if found else []
+                found[one] = axis.fit((*other_effects, one)).log_likelihood - penalty
+    return max(found, key=lambda one: found[one]) if found else None
 
 
 def propose_drifts_and_steps(whitened: WhitenedAxis) -> list[Effect]:

@@ -22,6 +22,7 @@ from drivers.data_types import Floats
 from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
+    BandwidthLimit,
     ExponentiallyCorrelated,
     HeavyTails,
     Narrowband,
@@ -58,6 +59,7 @@ from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidate_effects import (
     DETERMINISTIC_CANDIDATES,
     NOISE_CANDIDATES,
+    fit_low_pass,
     initial_effect_size,
     propose_correlated_noise,
     propose_power_law,
@@ -402,6 +404,7 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
     ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found += _moved_feature_trials(hypothesis, found)
+    found += _changed_low_pass_trials(hypothesis)
     if not hypothesis.axis.is_model_fitted:
         found.append(_scale_factor_trial(hypothesis, resized))
     found = _best_first(found)
@@ -429,6 +432,27 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
             score = gain - PENALTY_NATS[new.name] + MOVE_ADVANTAGE_NATS - distance
             found.append(Trial(new.name, effect, score, moved=at))
     return found
+
+
+def _changed_low_pass_trials(hypothesis: Hypothesis) -> list[Trial]:
+    """Try another cutoff, kind and order of a low-pass filter of the model.
+
+    A filter changes if the sensor has another bandwidth setting.
+    """
+    places = [at for at, known in enumerate(hypothesis.model) if isinstance(known, BandwidthLimit)]
+    if len(places) != 1:
+        return []
+    (at,) = places
+    known = hypothesis.model[at]
+    assert isinstance(known, BandwidthLimit)
+    fitted = fit_low_pass(hypothesis.axis, (*hypothesis.effects[:at], *hypothesis.effects[at + 1 :]))
+    if fitted is None:
+        return []
+    effect = replace(fitted, floor=known.floor)
+    model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
+    changed = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
+    gain = changed.penalised_log_likelihood - hypothesis.penalised_log_likelihood
+    return [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at)]
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:

@@ -17,7 +17,7 @@ from typing import Final
 
 from drivers.data_types import AXES
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Narrowband, Sinusoidal
+from monitor.noise.effects import BandwidthLimit, Narrowband, Sinusoidal
 from monitor.reconcile.effect_properties import NOISE_SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
@@ -50,7 +50,7 @@ class RankedGapCause:
     axes: tuple[str, ...]
     parameters: dict[str, ParameterInterval]  # of the axis with the largest gain
     size_ratio: float | None  # new size relative to the size in the model, on this axis
-    old_frequency: float | None  # Hz, of a line or resonance that has moved, on this axis
+    old_frequency: float | None  # Hz, of a line, resonance or cutoff that has moved, on this axis
     confidence: float  # of the name, on this axis
     gain_nats: float  # explained part of the gap, over all axes
     share: float  # of the whole gap of the recording
@@ -147,8 +147,9 @@ def _belongs_to(group: Sequence[_AxisStep], one: _AxisStep, r: Reconciliation) -
 
 
 def _factors_agree(axis: str, ratio: float, other_axis: str, other_ratio: float) -> bool:
-    """Return True if the sizes on two axes of one triad changed by nearly the same factor."""
-    return axis[0] == other_axis[0] and abs(log(ratio / other_ratio)) <= MAX_LOG_RATIO_DIFFERENCE
+    """Return True if two sizes changed by nearly the same factor. Axes of both triads agree if no size changed."""
+    same_triad, unchanged = axis[0] == other_axis[0], abs(log(ratio)) <= MAX_LOG_RATIO_DIFFERENCE
+    return (same_triad or unchanged) and abs(log(ratio / other_ratio)) <= MAX_LOG_RATIO_DIFFERENCE
 
 
 def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:
@@ -167,11 +168,12 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
 
 
 def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:
-    """Return the frequency in the model, in Hz, of a line or resonance that has moved, or None for other steps."""
+    """Return the frequency in the model, in Hz, of a line, resonance or cutoff that has moved, or None."""
     before, place = _effect_before(axis, step, r, "frequency"), find_identifying_parameter(step, axis, r.model)
-    if step.kind != "retuned" or not isinstance(before, Sinusoidal | Narrowband) or place is None:
+    if step.kind != "retuned" or not isinstance(before, Sinusoidal | Narrowband | BandwidthLimit) or place is None:
         return None
-    return before.frequency if before.frequency != place.value else None
+    old = before.cutoff if isinstance(before, BandwidthLimit) else before.frequency
+    return old if old != place.value else None
 
 
 def _effect_before(axis: str, step: AddedOrResizedEffect, r: Reconciliation, size_name: str) -> Effect | None:

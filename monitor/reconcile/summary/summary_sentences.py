@@ -149,7 +149,8 @@ def describe_finding(finding: RankedGapCause) -> str:
     if source is not None:
         details.append(f"from {source.value}")
     if finding.old_frequency is not None:
-        details[0] = f"moved from {finding.old_frequency:.4g} to {numbers['frequency']:.4g} Hz"
+        start, name = ("moved", "frequency") if "frequency" in numbers else ("with a cutoff that moved", "cutoff")
+        details[0] = f"{start} from {finding.old_frequency:.4g} to {numbers[name]:.4g} Hz"
     if finding.kind == "retuned" and not (finding.old_frequency is not None and _is_nearly_one(finding.size_ratio)):
         details.append(f"times {finding.size_ratio:.3g}" if finding.size_ratio else "of another size")
     elif finding.kind == "absent":

@@ -48,7 +48,7 @@ RATE_HZ = 100.0
 
 def test_transforms_act_in_a_fixed_order():
     assert [kind.name for kind in TRANSFORM_ORDER] == [
-        "scale_factor", "bandwidth_limit", "sample_rate_error", "saturation", "resolution", "sample_hold",
+        "bandwidth_limit", "scale_factor", "sample_rate_error", "saturation", "resolution", "sample_hold",
         "unit_error",
     ]  # fmt: skip
     axis = (Resolution(step=0.4), Saturation(limit=1.0), ConstantBias(value=0.7), ScaleFactor(factor=2.0))

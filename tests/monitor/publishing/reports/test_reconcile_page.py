@@ -76,9 +76,9 @@ def test_summary_figures_and_findings_come_first() -> None:
 def test_axes_that_agree_are_one_folded_line_each() -> None:
     folded = re.findall(r"<details>\s*<summary>(.*?)</summary>", render_example("explained"), flags=re.S)
     lines = [" ".join(PageText(f"<p>{one}</p>").words.split()) for one in folded]
-    assert lines[0] == "Every step and diagnostic of gz"
-    assert [line[:2] for line in lines[1:-1]] == ["gx", "gy", "ax", "ay", "az"]
-    assert all(re.fullmatch(r"\w\w agrees largest gap: .*: gap [\d.]+, threshold [\d.]+", line) for line in lines[1:-1])
+    assert lines[:2] == ["1 smaller finding", "Every step and diagnostic of gz"]
+    assert [line[:2] for line in lines[2:-1]] == ["gx", "gy", "ax", "ay", "az"]
+    assert all(re.fullmatch(r"\w\w agrees largest gap: .*: gap [\d.]+, threshold [\d.]+", line) for line in lines[2:-1])
 
 
 def test_step_states_location_effect_reason_and_confidence() -> None:

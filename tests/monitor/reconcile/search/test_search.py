@@ -21,6 +21,7 @@ from monitor.noise.effects import (
     WanderingVariance,
 )
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.axis_result_builder import build_axis_result
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
 from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_missing_effects
@@ -314,6 +315,40 @@ def test_moved_line_of_the_model_is_no_new_line(known, new_hz):
     assert found.hypothesis.effects[2].frequency == pytest.approx(new_hz, abs=0.1)
     assert found.hypothesis.effects[3].frequency == 5.0
     assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
+
+
+@pytest.mark.parametrize(("cutoff_hz", "order"), [(12.0, 1), (40.0, 1), (20.0, 2)])
+def test_changed_filter_of_the_model_is_no_new_effect(cutoff_hz, order):
+    known = BandwidthLimit(cutoff=28.0, order=1, floor=0.1 * N, kind="butterworth")
+    model = (*MODEL, known)
+    true = NoiseModel({"gz": (*MODEL, replace(known, cutoff=cutoff_hz, order=order))}).simulate(n, RATE_HZ, 34)
+    found = search_axis(true[:, 2].copy(), model)
+    assert list_added(found) == []
+    assert [trial.moved for trial in (one.trials[0] for one in found.rounds)] == [2]
+    low_pass = found.hypothesis.effects[2]
+    assert low_pass.cutoff == pytest.approx(cutoff_hz, rel=0.05)
+    assert low_pass.order == order
+    assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
+    (step,) = build_axis_result(found, STRICT, STRICT).steps
+    assert (step.kind, step.effect) == ("retuned", "bandwidth_limit")
+    assert "another cutoff of bandwidth_limit" in step.because
+
+
+def test_factor_of_an_axis_with_a_filter_also_multiplies_the_noise_after_the_filter():
+    model = (*MODEL, BandwidthLimit(cutoff=15.0, order=1, floor=0.3 * N, kind="butterworth"))
+    true = NoiseModel({"gz": model}).simulate(n, RATE_HZ, 36)[:, 2]
+    found = search_axis(1.25 * true, model)
+    (factor,) = found.hypothesis.added
+    assert factor.name == "scale_factor"
+    assert factor.factor == pytest.approx(1.25, rel=0.01)
+
+
+def test_unchanged_filter_of_the_model_is_kept():
+    model = (*MODEL, BandwidthLimit(cutoff=28.0, order=1, floor=0.1 * N, kind="butterworth"))
+    true = NoiseModel({"gz": model}).simulate(n, RATE_HZ, 35)[:, 2] + 2e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
+    found = search_axis(true, model)
+    assert list_added(found) == ["sinusoidal"]
+    assert found.hypothesis.effects[2] == model[2]
 
 
 def test_new_line_beside_a_line_of_the_model_is_added():

@@ -17,6 +17,7 @@ from monitor.reconcile.result import (
     RemainingGap,
 )
 from monitor.reconcile.summary.ranked_findings import rank_findings
+from monitor.reconcile.summary.summary_sentences import describe_finding
 from tests.monitor.reconcile.runs_made import around, step
 
 EMPTY = AxisModelDiagnostics((), ())
@@ -112,6 +113,19 @@ def test_moved_resonance_states_the_old_frequency():
     model = NoiseModel({"gx": (effects[0], replace(effects[1], frequency=19.5))})
     (one,) = rank_findings(replace(make_result({"gx": [moved]}, effects=effects), model=model)).findings
     assert (one.old_frequency, one.size_ratio) == (20.0, pytest.approx(1.0))
+
+
+def test_changed_cutoff_of_both_triads_is_one_finding():
+    known, changed = BandwidthLimit(cutoff=40.0, floor=1e-5), BandwidthLimit(cutoff=20.0, floor=1e-5)
+    steps = {
+        axis: [make_step("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-5, 0.0), cutoff=around(20.0, 0.1))]
+        for axis in ("gx", "ax")
+    }
+    r = make_result(steps, effects=(known,))
+    r = replace(r, model=NoiseModel(dict.fromkeys(steps, (changed,))))
+    (one,) = rank_findings(r).findings
+    assert (one.axes, one.old_frequency) == (("gx", "ax"), 40.0)
+    assert describe_finding(one) == "low-pass filter with a cutoff that moved from 40 to 20 Hz on gx and ax"
 
 
 def test_shares_of_findings_and_remaining_gaps_sum_to_one():
