@@ -30,6 +30,8 @@ PAGES: Final = sorted((Path(__file__).resolve().parents[2] / "docs" / "reference
 PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 SHARED_BY: Final = 3
 """Minimum number of commands sharing an option for the option to be described only once."""
+RECORDING_OPTIONS: Final = r"\| `--(topic|columns|\w+-unit|decoder|option) "
+"""Rows of the options that all commands that read recordings have."""
 
 
 def format_commands() -> str:
@@ -37,14 +39,17 @@ def format_commands() -> str:
     commands = dict(_commands(typer.main.get_command(app), ""))
     uses = Counter(_option_row(one) for command in commands.values() for one in _options(command))
     shared = [row for row, times in uses.items() if times >= SHARED_BY]
+    for_recordings = [row for row in shared if re.match(RECORDING_OPTIONS, row)]
+    shared = [row for row in shared if row not in for_recordings]
     parts = []
     for name, command in commands.items():
         arguments = [one for one in command.params if one.param_type_name == "argument"]
         usage = " ".join(["imu-monitor", name, *(_metavar(one) for one in arguments)])
         rows = [f"| `{_metavar(one)}` | {_sentence(getattr(one, 'help', None))} |" for one in arguments]
         own = [_option_row(one) for one in _options(command)]
-        rows += [row for row in own if row not in shared]
+        rows += [row for row in own if row not in shared and row not in for_recordings]
         common = [f"`{row.split('`')[1].split()[0]}`" for row in own if row in shared]
+        common += ["[options for recordings](#options-for-recordings)"] if set(for_recordings) <= set(own) else []
         parts += [
             f"### `{name}`",
             f"```sh\n{usage}\n{_example(command, usage)}```",
@@ -52,7 +57,8 @@ def format_commands() -> str:
         ]
         parts += [_table(("argument or option", "meaning"), rows)] if rows else []
         parts += [f"[Shared options](#shared-options): {', '.join(common)}."] if common else []
-    parts += ["### Shared options", _table(("option", "meaning"), shared)]
+    for title, rows in (("Shared options", shared), ("Options for recordings", for_recordings)):
+        parts += [f"### {title}", _table(("option", "meaning"), rows)]
     return "\n\n".join(parts)
 
 
@@ -146,7 +152,8 @@ def format_messages() -> str:
     """Describe the fields of each message."""
     parts = []
     for one in filter(_is_message, vars(results).values()):
-        parts += [f"### `{one.topic.name}`", _description(one), *_fields(one)]
+        if fields := _fields(one):
+            parts += [f"### `{one.topic.name}`", fields]
     return "\n\n".join(parts)
 
 
@@ -154,13 +161,9 @@ def _is_message(one: object) -> bool:
     return isinstance(one, type) and issubclass(one, Message) and "topic" in vars(one)
 
 
-def _description(one: type) -> str:
-    return " ".join((inspect.getdoc(one) or "").replace("``", "`").split())
-
-
-def _fields(message: type[msgspec.Struct]) -> list[str]:
+def _fields(message: type[msgspec.Struct]) -> str:
     rows = [row for row in _rows(message, "") if row.split("`")[1] not in Message.__struct_fields__]
-    return [_table(("key", "meaning"), rows)] if rows else []
+    return _table(("key", "meaning"), rows) if rows else ""
 
 
 def _rows(struct: type[msgspec.Struct], path: str) -> Iterator[str]:
