@@ -47,7 +47,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    epilog="Examples: imu-monitor demo; imu-monitor identify /dev/ttyUSB0; imu-monitor analyze run.csv",
+    epilog="\b\nExamples:\n  imu-monitor demo\n  imu-monitor identify /dev/ttyUSB0\n  imu-monitor analyze run.csv",
 )
 
 

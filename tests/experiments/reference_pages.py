@@ -28,8 +28,10 @@ from monitor.settings.printed_defaults import FIRST_LINK, describe_keys, format_
 
 PAGES: Final = sorted((Path(__file__).resolve().parents[2] / "docs" / "reference").glob("*.md"))
 PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-SHARED_BY: Final = 4
+SHARED_BY: Final = 3
 """Minimum number of commands sharing an option for the option to be described only once."""
+RECORDING_OPTIONS: Final = r"\| `--(topic|columns|\w+-unit|decoder|option) "
+"""Rows of the options that all commands that read recordings have."""
 
 
 def format_commands() -> str:
@@ -37,18 +39,26 @@ def format_commands() -> str:
     commands = dict(_commands(typer.main.get_command(app), ""))
     uses = Counter(_option_row(one) for command in commands.values() for one in _options(command))
     shared = [row for row, times in uses.items() if times >= SHARED_BY]
+    for_recordings = [row for row in shared if re.match(RECORDING_OPTIONS, row)]
+    shared = [row for row in shared if row not in for_recordings]
     parts = []
     for name, command in commands.items():
         arguments = [one for one in command.params if one.param_type_name == "argument"]
         usage = " ".join(["imu-monitor", name, *(_metavar(one) for one in arguments)])
         rows = [f"| `{_metavar(one)}` | {_sentence(getattr(one, 'help', None))} |" for one in arguments]
         own = [_option_row(one) for one in _options(command)]
-        rows += [row for row in own if row not in shared]
+        rows += [row for row in own if row not in shared and row not in for_recordings]
         common = [f"`{row.split('`')[1].split()[0]}`" for row in own if row in shared]
-        parts += [f"### `{name}`", f"```sh\n{usage}\n{_example(command)}```", " ".join((command.help or "").split())]
+        common += ["[options for recordings](#options-for-recordings)"] if set(for_recordings) <= set(own) else []
+        parts += [
+            f"### `{name}`",
+            f"```sh\n{usage}\n{_example(command, usage)}```",
+            " ".join((command.help or "").split()),
+        ]
         parts += [_table(("argument or option", "meaning"), rows)] if rows else []
         parts += [f"[Shared options](#shared-options): {', '.join(common)}."] if common else []
-    parts += ["### Shared options", _table(("option", "meaning"), shared)]
+    for title, rows in (("Shared options", shared), ("Options for recordings", for_recordings)):
+        parts += [f"### {title}", _table(("option", "meaning"), rows)]
     return "\n\n".join(parts)
 
 
@@ -60,8 +70,9 @@ def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
             yield f"{prefix}{name}", command
 
 
-def _example(command: Any) -> str:
-    return f"{command.epilog.removeprefix('Example: ')}    # example\n" if command.epilog else ""
+def _example(command: Any, usage: str) -> str:
+    example = (command.epilog or usage).removeprefix("Example: ")
+    return "" if example == usage else f"{example}    # example\n"
 
 
 def _options(command: Any) -> list[Any]:
@@ -97,32 +108,52 @@ def format_configuration() -> str:
     """Describe the keys of all tables of a configuration file."""
     parts = []
     for name, model in list_tables():
-        parts += [f"### `{name}`", _keys(model, ("driver", "axes", "limit") if name == "[[device]]" else ())]
-    parts.append("## Links")
-    for name in sorted(driver_settings.list_link_names(), key=lambda one: (one != FIRST_LINK, one)):
-        parts += [f'### `link = "{name}"`', _keys(driver_settings.link_settings_class(name), ("faults",))]
-    parts += ["### `[device.driver.faults]`", "Faults of a virtual sensor.", _keys(driver_settings.FaultsTable)]
+        parts += [
+            f"### `{name}`",
+            _key_table(_key_rows(model, ("driver", "axes", "limit") if name == "[[device]]" else ())),
+        ]
+    names = sorted(driver_settings.list_link_names(), key=lambda one: (one != FIRST_LINK, one))
+    links = {name: _key_rows(driver_settings.link_settings_class(name), ("faults",)) for name in names}
+    shared = [row for row in links[FIRST_LINK] if all(row in rows for rows in links.values())]
+    parts += ["## Links", "Keys of every link:", _key_table(shared)]
+    for name, rows in links.items():
+        parts += [f'### `link = "{name}"`', _key_table(row for row in rows if row not in shared)]
+    parts += [
+        "### `[device.driver.faults]`",
+        "Faults of a virtual sensor.",
+        _key_table(_key_rows(driver_settings.FaultsTable)),
+    ]
     parts += ["## Decoders", "These keys belong to the table `[device.driver.decoder_options]`."]
-    for name in module_lookup.list_modules(drivers.decoders):
-        parts += [f'### `decoder = "{name}"`', _keys(module_lookup.import_module(drivers.decoders, name).Settings)]
+    decoders = {
+        name: _key_rows(module_lookup.import_module(drivers.decoders, name).Settings)
+        for name in module_lookup.list_modules(drivers.decoders)
+    }
+    without_keys = ", ".join(f"`{name}`" for name, rows in decoders.items() if not rows)
+    parts.append(f"These decoders have no keys: {without_keys}.")
+    for name, rows in decoders.items():
+        parts += [f'### `decoder = "{name}"`', _key_table(rows)] if rows else []
     return "\n\n".join(parts)
 
 
-def _keys(model: type[SettingsModel], omit: tuple[str, ...] = ()) -> str:
-    rows = [
+def _key_rows(model: type[SettingsModel], omit: tuple[str, ...] = ()) -> list[str]:
+    return [
         f"| `{key.name}` | {f'`{_cell(format_toml_value(key.value))}`' if key.has_default else ''} "
         f"| {'required; ' if key.required else ''}{_cell(key.description)} |"
         for key in describe_keys(model)
         if key.name not in omit
     ]
-    return _table(("key", "default", "meaning"), rows) if rows else "This decoder has no keys."
+
+
+def _key_table(rows: Iterable[str]) -> str:
+    return _table(("key", "default", "meaning"), rows)
 
 
 def format_messages() -> str:
     """Describe the fields of each message."""
     parts = []
     for one in filter(_is_message, vars(results).values()):
-        parts += [f"### `{one.topic.name}`", _description(one), *_fields(one)]
+        if fields := _fields(one):
+            parts += [f"### `{one.topic.name}`", fields]
     return "\n\n".join(parts)
 
 
@@ -130,13 +161,9 @@ def _is_message(one: object) -> bool:
     return isinstance(one, type) and issubclass(one, Message) and "topic" in vars(one)
 
 
-def _description(one: type) -> str:
-    return " ".join((inspect.getdoc(one) or "").replace("``", "`").split())
-
-
-def _fields(message: type[msgspec.Struct]) -> list[str]:
+def _fields(message: type[msgspec.Struct]) -> str:
     rows = [row for row in _rows(message, "") if row.split("`")[1] not in Message.__struct_fields__]
-    return [_table(("key", "meaning"), rows)] if rows else []
+    return _table(("key", "meaning"), rows) if rows else ""
 
 
 def _rows(struct: type[msgspec.Struct], path: str) -> Iterator[str]:

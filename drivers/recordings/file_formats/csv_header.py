@@ -91,7 +91,9 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
     if not number:
         return None
     if comment is None or not names_an_axis(split_header(comment.text)):
-        comment = _Line("", number, 0, 0)
+        raise RecordingError(
+            f"{label}: contains only comments and blank lines, expected a header such as {table.EXAMPLE_HEADER}"
+        )
     return _build_header(path, label, comment, None, b"", number + 1)
 
 
@@ -204,7 +206,7 @@ def _build_header(
 ) -> CsvHeader:
     """Return the header with the separator that fits the first line of samples."""
     text = header.text.lstrip("#% ")
-    if "\0" in text or not text:
+    if "\0" in text:
         raise RecordingError(
             f"{label}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
             f"{table.describe_suffix_mismatch(path)}"

@@ -282,7 +282,7 @@ def _summary(states: RemoteDeviceRegistry, devices: list[RemoteDevice], now_s: f
         line.append(
             f"  {states.ignored:,} messages of more than {MAX_DEVICES:,} devices ignored", style="not bold yellow"
         )
-    if states.note:
+    if states.note and ran_s is None:
         line.append(f"\n{states.note}", style="not bold yellow")
     return line
 

@@ -101,7 +101,7 @@ def tables(chunks: list[Chunk]) -> str:
     parts = [
         "Correct results, %. Deviations are averaged over τ up to an eighth of the record, with the worst τ in "
         "parentheses:",
-        format_table(("record", "noise", "records", "deviations", *SYMBOLS), [_correct(*g) for g in groups.items()]),
+        format_table(("record", "noise", "deviations", *SYMBOLS), [_correct(*g) for g in groups.items()]),
         "Records in which a term is estimated, %. Parentheses mark terms that the noise does not contain:",
         format_table(("record", "noise", *SYMBOLS), [_estimated(*g) for g in groups.items()]),
         "A figure is bold if its 95 % interval lies entirely outside the expected range. The expected range is "
@@ -129,7 +129,7 @@ def _correct(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:
             for names in (("held", "bound_held"), ("estimated", "bounded"))
         )
         terms.append(_share(covered, given, RESULT_TARGET) if letter in CELLS[cell].present_terms() else "–")
-    return format_length(seconds), cell, str(records), deviations, *terms
+    return format_length(seconds), cell, deviations, *terms
 
 
 def _estimated(key: tuple[int, str], group: list[Chunk]) -> tuple[str, ...]:

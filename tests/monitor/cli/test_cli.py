@@ -717,6 +717,7 @@ def test_allan_deviations_equal_allantools(run_program: RunProgram, recording: P
     ("name", "content", "message"),
     [
         ("x.csv", b"", "x.csv: the file is empty"),
+        ("x.csv", b"# a\n\n# b\n", "x.csv: contains only comments and blank lines, expected a header such as t,gx,"),
         ("x.csv", b"t,gx\n", "x.csv: has a header line but no complete line of samples"),
         (
             "x.csv",

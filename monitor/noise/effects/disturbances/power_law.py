@@ -41,7 +41,7 @@ class PowerLaw(Source):
     density: float = parameter_field("rad/s/√Hz", "m/s²/√Hz")
     exponent: float = parameter_field("1", maximum=MAX_EXPONENT)
 
-    description: ClassVar[str] = "The bias fluctuates with noise between white noise, 1/f noise and a random walk."
+    description: ClassVar[str] = "The spectral density of the noise is a power of the frequency."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum, and the Allan variance by numerical integration."""

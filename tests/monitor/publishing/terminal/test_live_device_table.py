@@ -144,8 +144,11 @@ def test_last_table_states_the_running_time(registry: RemoteDeviceRegistry) -> N
     registry.set_allan_curve("imu/bench-1", example_results.make_estimate().curve)
     stream = io.StringIO()
     table = live_device_table.LiveTable(Console(file=stream, width=100), registry, begun_s=time.monotonic() - 75.0)
+    registry.note = "viewer: http://127.0.0.1:9090"
+    assert registry.note in render_table(registry, 100)
     text = table.render([], is_last=True)
     assert text.startswith("imu-monitor ran for 1 min 15 s  1 device")
+    assert registry.note not in text
     assert "Allan deviation, °/h" in text
 
 
