@@ -308,7 +308,7 @@ def _justification(
         sentences = [f"{effect.name} explains a difference that no diagnostic alone detects: {gaps}."]
     if kind != "added":
         is_moved = trial.moved is not None and trial.name == effect.name
-        parameter = EFFECT_PROPERTIES[effect.name].identity if is_moved else "size"
+        parameter = (EFFECT_PROPERTIES[effect.name].identity or "step") if is_moved else "size"
         change = f"another {parameter} of" if kind == "retuned" else "no"
         sentences.append(f"With {change} {effect.name}, which the model has, the gap is {after.gap:.1f}.")
         return " ".join(sentences)

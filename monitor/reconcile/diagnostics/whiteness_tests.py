@@ -49,6 +49,8 @@ HYSTERESIS_FRACTIONS: Final = (0.05, 0.2)
 """Values of the parameter ``reversal`` of the tested hysteresis, as fractions of the temperature range."""
 MAX_STEP_GRID: Final = 1 << 15
 """Number of times on a coarse grid for the weights of steps in a long recording."""
+MAX_STEP_DIFFERENCE: Final = 0.01
+"""Largest relative difference between the quantization step of the recording and of the model."""
 STEP_MARGIN_FRACTION: Final = 0.001
 """Fraction of the recording, at each end, in which steps are not detected.
 """
@@ -382,13 +384,28 @@ def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> WhitenessD
         (Saturation, statistics.clipping),
         (RandomSampleHold, statistics.repeats),
     ):
-        if found is not None and kind not in whitened.effect_types and found.gain > best.gain:
+        is_known = kind in whitened.effect_types
+        if kind is Resolution and is_known:
+            is_known = find_changed_resolution(whitened) is None
+        if found is not None and not is_known and found.gain > best.gain:
             best = WhitenessDeparture(found.gain, Location())
     if best.gain and statistics.clipping is not None and best.gain == statistics.clipping.gain:
         return WhitenessDeparture(
             best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi))
         )
     return best
+
+
+def find_changed_resolution(whitened: WhitenedAxis) -> int | None:
+    """Return the index of the quantization of the model if the recorded values have another step, or None."""
+    quantization = whitened.axis.value_artifacts.quantization
+    if quantization is None:
+        return None
+    for at, effect in enumerate(whitened.effects):
+        if isinstance(effect, Resolution):
+            same = abs(quantization.step.value / effect.step - 1.0) < MAX_STEP_DIFFERENCE
+            return None if same else at
+    return None
 
 
 DIAGNOSTICS: Final[dict[str, Diagnostic]] = {

@@ -38,10 +38,10 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     Hypothesis,
     compute_size_interval,
     find_maximum_by_golden_section,
-    fit_shape_parameter,
     noise_effect_indices,
 )
 from monitor.reconcile.recording_checks.checks import TRIADS
+from monitor.reconcile.search.candidate_effects import fit_resonance
 from monitor.reconcile.search.cross_validation import accept_without_validation
 from monitor.reconcile.search.search import AxisSearchResult, SearchRound, diagnose_hypothesis
 from monitor.reconcile.search.trials import SCALE_FACTOR_MARGIN_NATS, SCALE_SEARCH_ITERATIONS, Trial
@@ -194,9 +194,7 @@ def _merge_peaks(hypothesis: Hypothesis, low: Sinusoidal | Narrowband, high: Sin
     middle = 0.5 * (low.frequency + high.frequency)
     width = max(high.frequency - low.frequency, *(getattr(one, "bandwidth", 0.0) for one in (low, high)))
     merged: Effect = Narrowband(sigma=axis.cosine_transform_rms, frequency=middle, bandwidth=width)
-    merged = fit_shape_parameter(axis, other_effects, merged, "bandwidth", 2.5)
-    merged = fit_shape_parameter(axis, other_effects, merged, "frequency", 1.0 + 0.7 * width / middle)
-    merged = fit_shape_parameter(axis, other_effects, merged, "bandwidth", 1.5)
+    merged = fit_resonance(axis, other_effects, merged)
     return hypothesis.refit_with_other_added_effects((*rest, merged))
 
 

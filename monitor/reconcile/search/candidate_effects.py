@@ -156,14 +156,26 @@ def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
             Narrowband(sigma=initial_effect_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
-        peak = _most_likely(axis, whitened.effects, trials)
-        peak = fit_shape_parameter(axis, whitened.effects, peak, "bandwidth", 2.5)
-        assert isinstance(peak, Narrowband)
-        peak = fit_shape_parameter(
-            axis, whitened.effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency
-        )
-        found.append(fit_shape_parameter(axis, whitened.effects, peak, "bandwidth", 1.5))
+        found.append(fit_resonance(axis, whitened.effects, _most_likely(axis, whitened.effects, trials)))
     return found
+
+
+def fit_resonance(axis: Axis, other_effects: Effects, first: Effect) -> Effect:
+    """Fit the frequency and the bandwidth of a resonance.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    other_effects : tuple of Effect
+        Other effects of the axis.
+    first : Effect
+        Resonance with the starting values.
+    """
+    peak = fit_shape_parameter(axis, other_effects, first, "bandwidth", 2.5)
+    assert isinstance(peak, Narrowband)
+    peak = fit_shape_parameter(axis, other_effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+    return fit_shape_parameter(axis, other_effects, peak, "bandwidth", 1.5)
 
 
 def find_broad_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> list[tuple[float, float]]:

@@ -39,7 +39,7 @@ from monitor.noise.effects import (
     WanderingVariance,
 )
 from monitor.noise.effects.disturbances.heavy_tails import DEGREES_OF_FREEDOM
-from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION
+from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION, find_changed_resolution
 from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
@@ -60,6 +60,7 @@ from monitor.reconcile.search.candidate_effects import (
     DETERMINISTIC_CANDIDATES,
     NOISE_CANDIDATES,
     fit_low_pass,
+    fit_resonance,
     initial_effect_size,
     propose_correlated_noise,
     propose_power_law,
@@ -209,10 +210,12 @@ def _as_rivals_of_noise(deterministic: Sequence[Trial]) -> list[Trial]:
 def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
     statistics = whitened.axis.value_artifacts
     found: list[Trial] = []
-    if statistics.quantization and Resolution not in whitened.effect_types:
+    changed = find_changed_resolution(whitened)
+    if statistics.quantization and (Resolution not in whitened.effect_types or changed is not None):
         grid = statistics.quantization
         resolution = Resolution(step=grid.step.value)
-        found.append(_penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels))
+        trial = _penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels)
+        found.append(replace(trial, moved=changed))
     if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.effect_types:
         ends = statistics.clipping
         saturation = Saturation(limit=ends.limit.value)
@@ -422,13 +425,17 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
             if not isinstance(new, Sinusoidal | Narrowband) or type(known) is not type(new):
                 continue
             effect: Effect = replace(known, frequency=new.frequency)
+            if isinstance(new, Narrowband):
+                others = (*hypothesis.effects[:at], *hypothesis.effects[at + 1 :])
+                effect = fit_resonance(hypothesis.axis, others, replace(new, sigma=effect_size(known)))
             model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
             moved = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
             size_ratio = effect_size(moved.effects[at]) / max(effect_size(known), 1e-300)
             if not 1.0 / MAX_MOVED_SIZE_RATIO < size_ratio < MAX_MOVED_SIZE_RATIO:
                 continue
             gain = moved.penalised_log_likelihood - hypothesis.penalised_log_likelihood
-            distance = abs(float(np.log(new.frequency / known.frequency)))
+            assert isinstance(effect, Sinusoidal | Narrowband)
+            distance = abs(float(np.log(effect.frequency / known.frequency)))
             score = gain - PENALTY_NATS[new.name] + MOVE_ADVANTAGE_NATS - distance
             found.append(Trial(new.name, effect, score, moved=at))
     return found

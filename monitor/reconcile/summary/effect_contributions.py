@@ -146,8 +146,11 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
         elif isinstance(effect, CommonVibration):
             trials = [one.trials[0] for one in search.rounds]
             found[at] = next((one.score for one in trials if one.effect == effect), 0.0)
-    moved = {one.trials[0].moved: one.trials[0].score for one in search.rounds if one.trials[0].moved is not None}
-    return found | {at: score for at, score in moved.items() if at is not None}
+    for trial in (one.trials[0] for one in search.rounds):
+        if trial.moved is not None:
+            is_quantized = isinstance(trial.effect, Resolution)
+            found[trial.moved] = value_artifact_gain(hypothesis.fit, Resolution) if is_quantized else trial.score
+    return found
 
 
 def _trials_of_effect(search: AxisSearchResult, effect: Effect) -> list[Trial]:

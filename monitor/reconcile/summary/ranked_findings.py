@@ -38,7 +38,7 @@ PEAK_NAMES: Final = ("sinusoidal", "narrowband", "wandering_line")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
 """Largest difference between the logarithms of two size ratios in the same finding."""
-_SIZE_NAMES: Final = NOISE_SIZE_PARAMETERS | {"scale_factor": "factor"}
+_SIZE_NAMES: Final = NOISE_SIZE_PARAMETERS | {"scale_factor": "factor", "resolution": "step"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,8 @@ def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> 
     if step.kind != "retuned" or not isinstance(before, Sinusoidal | Narrowband | BandwidthLimit) or place is None:
         return None
     old = before.cutoff if isinstance(before, BandwidthLimit) else before.frequency
-    return old if old != place.value else None
+    unchanged = old == place.value or (place.lo is not None and place.hi is not None and place.lo <= old <= place.hi)
+    return None if unchanged else old
 
 
 def _effect_before(axis: str, step: AddedOrResizedEffect, r: Reconciliation, size_name: str) -> Effect | None:

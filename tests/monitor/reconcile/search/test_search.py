@@ -15,6 +15,7 @@ from monitor.noise.effects import (
     Outliers,
     PowerLaw,
     RateRandomWalk,
+    Resolution,
     Sinusoidal,
     TemperatureBias,
     TemperatureHysteresis,
@@ -329,9 +330,38 @@ def test_changed_filter_of_the_model_is_no_new_effect(cutoff_hz, order):
     assert low_pass.cutoff == pytest.approx(cutoff_hz, rel=0.05)
     assert low_pass.order == order
     assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
-    (step,) = build_axis_result(found, STRICT, STRICT).steps
+    step = build_axis_result(found, STRICT, STRICT).steps[0]
     assert (step.kind, step.effect) == ("retuned", "bandwidth_limit")
     assert "another cutoff of bandwidth_limit" in step.because
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_other_quantization_step_is_no_new_effect(ratio):
+    model = (*MODEL, Resolution(step=N * 8.0))
+    true = NoiseModel({"gz": (*MODEL, Resolution(step=ratio * N * 8.0))}).simulate(n, RATE_HZ, 37)[:, 2]
+    found = search_axis(true.copy(), model)
+    assert list_added(found) == []
+    assert found.hypothesis.effects[2].step == pytest.approx(ratio * N * 8.0, rel=1e-3)
+    (step,) = build_axis_result(found, STRICT, STRICT).steps
+    assert (step.kind, step.effect) == ("retuned", "resolution")
+    assert "another step of resolution" in step.because
+    assert step.gain_nats < n  # a step is certain, but its gain is limited to the change of the noise
+
+
+def test_same_quantization_step_agrees():
+    model = (*MODEL, Resolution(step=N * 8.0))
+    found = search_axis(NoiseModel({"gz": model}).simulate(n, RATE_HZ, 38)[:, 2].copy(), model)
+    assert found.rounds == ()
+
+
+def test_other_bandwidth_of_a_resonance_is_no_new_effect():
+    known = Narrowband(sigma=4e-4, frequency=17.3, bandwidth=0.3)
+    true = NoiseModel({"gz": (*MODEL, replace(known, bandwidth=2.0))}).simulate(n, RATE_HZ, 39)
+    found = search_axis(true[:, 2].copy(), (*MODEL, known))
+    assert list_added(found) == []
+    resonance = found.hypothesis.effects[2]
+    assert resonance.bandwidth == pytest.approx(2.0, rel=0.2)
+    assert resonance.sigma == pytest.approx(4e-4, rel=0.1)
 
 
 def test_factor_of_an_axis_with_a_filter_also_multiplies_the_noise_after_the_filter():
