@@ -358,6 +358,19 @@ def test_web_viewer_uses_the_next_free_port_and_releases_it(monkeypatch: pytest.
     assert not sinks.is_listening(port)
 
 
+def test_viewer_program_records_no_usage_statistics(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("CI", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    port, web_port = free_port(), free_port()
+    child = sinks.ViewerProcess(
+        ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
+    )
+    wait_for(lambda: sinks.is_rerun_server(port))
+    child.terminate()
+    assert not list(tmp_path.rglob("*analytics*"))
+
+
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="ending a program with its parent needs setpriv")
 def test_killed_daemon_ends_its_viewer() -> None:
