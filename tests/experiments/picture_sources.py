@@ -23,14 +23,15 @@ TEMPLATES: Final = Path(html_page.__file__).parent / "templates"
 REPORT_TEMPLATES: Final = (TEMPLATES / "page.html.j2", TEMPLATES / "report.html.j2")
 
 
-def describe_viewer(*devices: str, fleet: bool = False) -> object:
-    """Describe the layout of the viewer for some devices, and the signs and colours of its Allan plots."""
+def describe_viewer(page: str, *devices: str, fleet: bool = False) -> object:
+    """Describe the page that a picture shows, the names of all pages, and the signs and colours of the Allan plots."""
     from monitor.publishing.rerun.allan_drawing import KEY
     from monitor.publishing.rerun.blueprint import blueprint
 
-    shown = [ViewerDeviceDescription(name, has_model=True, has_thermal=True, compensated=True) for name in devices]
+    listed = [ViewerDeviceDescription(name, has_model=True, has_thermal=True, compensated=True) for name in devices]
+    pages = {one.name: one for one in blueprint(listed, fleet).root_container.contents}
     colours = {name: value for name, value in vars(axis_colours).items() if name.isupper()}
-    return _describe_view(blueprint(shown, fleet).root_container), KEY, colours
+    return list(pages), _describe_view(pages[page]), KEY, colours
 
 
 def _describe_view(part: Any) -> object:
@@ -59,20 +60,14 @@ def _describe_texts(figure: Any) -> list[str]:
 
 SOURCES: Final[dict[str, Callable[[], object]]] = {
     **dict.fromkeys(
-        (
-            "viewer",
-            "viewer-dynamic",
-            "viewer-gap",
-            "viewer-temperature",
-            "viewer-drift",
-            "viewer-history",
-            "viewer-web",
-            "demo-effect",
-        ),
-        lambda: describe_viewer("bench-1"),
+        ("viewer", "viewer-history", "viewer-web", "demo-effect"), lambda: describe_viewer("Device", "bench-1")
     ),
-    "viewer-fleet": lambda: describe_viewer("a", "b", "c"),
-    "view-fleet": lambda: describe_viewer("a", "b", fleet=True),
+    "viewer-dynamic": lambda: describe_viewer("What changed", "bench-1"),
+    "viewer-temperature": lambda: describe_viewer("Temperature", "bench-1"),
+    "viewer-drift": lambda: describe_viewer("Drift", "bench-1"),
+    "viewer-gap": lambda: describe_viewer("Model gap", "bench-1"),
+    "viewer-fleet": lambda: describe_viewer("Overview", "a", "b", "c"),
+    "view-fleet": lambda: describe_viewer("Fleet", "a", "b", fleet=True),
     **dict.fromkeys(("allan-plot", "dynamic-plot"), describe_allan_figure),
     "report": lambda: (describe_allan_figure(), [path.read_text("utf-8") for path in REPORT_TEMPLATES]),
 }

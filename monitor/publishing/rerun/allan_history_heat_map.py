@@ -108,7 +108,7 @@ LABEL_ABOVE_PX: Final = 6.0  # distance of the point of a label above the centre
 TIME_INSET_PX: Final = 20.0  # distance of the time labels from the ends of the image
 BAR_X: Final = COLUMNS + 9.0
 BAR_STEPS: Final = 24
-LABEL_MARGINS_PX: Final = (44.0, 7.0, 52.0, 20.0)  # left, above, right and below the image, for labels
+LABEL_MARGINS_PX: Final = (44.0, 7.0, 52.0, 23.0)  # left, above, right and below the image, for labels
 
 
 def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:

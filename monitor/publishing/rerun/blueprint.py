@@ -61,7 +61,7 @@ DESCRIPTIONS: Final = {
     "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device.",
     "thermal/..": "**Bias:** the grey line is the prediction from temperature, and thin lines are its 95 % interval.",
     "compensated": "**Rates:** measured rate in grey, and rate without the predicted drift in colour.",
-    "drift/g.": "**Drift:** means at rest, with the prediction in grey and its 95 % interval.",
+    "drift/g.": "**Drift:** means at rest in colour, prediction in grey, and its 95 % interval in thin lines.",
     "innovation/g.": "**Innovation:** differences of the means from their predictions, mostly within ±2 σ.",
     "drift": "**Drift models:** model and predicted drift of each gyroscope.",
 }
@@ -190,7 +190,7 @@ def _overview(devices: Sequence[str], units: UnitSystem, fleet: bool) -> rrb.Con
             active_tab=0,
         ),
         _event_list("/overview/events"),
-        row_shares=[5, 2],
+        row_shares=[3, 1],
     )
     name = "Fleet" if fleet else "Overview"
     if not devices:

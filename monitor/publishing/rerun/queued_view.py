@@ -282,7 +282,6 @@ def _load_rerun() -> None:
     """
     given = os.environ.get("RUST_LOG")
     os.environ["RUST_LOG"] = given or "off"
-    os.environ.setdefault("RERUN_ANALYTICS", "0")
     try:
         rerun = importlib.import_module("rerun")
     finally:

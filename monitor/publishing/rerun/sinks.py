@@ -55,7 +55,8 @@ class ViewerProcess:
 
     def __init__(self, arguments: list[str]) -> None:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
-        quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
+        # CI is the only variable that switches the usage statistics of Rerun off.
+        quiet = {"CI": "1", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
         self._process = subprocess.Popen(
             [*_death_signal_prefix(), str(viewer_program_path()), *arguments],
             stdin=subprocess.DEVNULL,

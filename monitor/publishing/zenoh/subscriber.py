@@ -115,8 +115,9 @@ class ZenohSubscriber:
         reasons = "; ".join(f"{endpoint}: {refusal}" for endpoint, refusal in absent.items() if refusal)
         if len(absent) == len(self._sessions):
             return f"{reasons or 'nobody at ' + every}; trying again"
-        there = f"{len(self._sessions) - len(absent)} of {len(self._sessions)} there ({every})"
-        return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
+        connected = f"connected to {len(self._sessions) - len(absent)} of {len(self._sessions)}"
+        missing = ", ".join(f"{endpoint} ({refusal})" if refusal else endpoint for endpoint, refusal in absent.items())
+        return f"{connected}; missing: {missing}; trying again"
 
     @property
     def all_connected_duration_s(self) -> float:

@@ -39,8 +39,8 @@ class DriftPanel(Panel):
                 axis_colours.AXIS_COLOURS[axis],
                 axis_colours.blend_colours(axis_colours.AXIS_COLOURS[axis], 0.45),
             )
-            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", axis_colours.GREY, 1.5)]
-            lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
+            lines = [(f"{axis} at rest, {unit}", colour, 1.0), (f"{axis} expected", axis_colours.GREY, 1.5)]
+            lines += [(f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             self._style_lines(f"drift/{axis}", lines)
             self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
 
@@ -112,12 +112,14 @@ class ThermalPredictionPanel(Panel):
     @classmethod
     def own_page(cls, device: ViewerDeviceDescription, units: UnitSystem, guide: rrb.View) -> rrb.Container | None:
         """Return the page of the temperature, and of the bias if it is predicted from temperature."""
-        below = rrb.Horizontal(temperature_view(device.name), guide)
+        temperature = temperature_view(device.name)
         if not device.has_thermal:
-            return rrb.Vertical(below, name="Temperature")
+            return rrb.Horizontal(temperature, guide, name="Temperature")
         columns = []
         for kind in KINDS:
             title = f"bias, {units.deviation(kind).name}"
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
-        return rrb.Vertical(rrb.Horizontal(*columns), below, row_shares=[4, 1], name="Temperature")
+        # Rerun labels an axis only if there is enough space, so the temperature has a high plot.
+        columns.append(rrb.Vertical(temperature, guide, row_shares=[2, 1]))
+        return rrb.Horizontal(*columns, column_shares=[3, 3, 2], name="Temperature")

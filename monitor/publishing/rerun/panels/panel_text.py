@@ -42,7 +42,7 @@ STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
     "lost": "LOST: no connection",
-    "ended": "ENDED: the end of the recording was reached",
+    "ended": "ENDED: end of the recording",
 }
 
 
@@ -58,7 +58,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     about
         Short description of the device.
     """
-    unknown = "no samples" if health.state == "lost" else "rate not known yet"
+    unknown = "no samples" if health.state in ("lost", "ended") else "rate not known yet"
     rate = unknown if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
     lines = [f"**{device}** {about}".rstrip() + f", **{rate}**", f"## {STATE_TEXTS.get(health.state, health.state)}"]
     if health.text:
@@ -69,10 +69,11 @@ def health_text(device: str, health: Health, about: str = "") -> str:
         f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
     )
-    latency = [format_milliseconds(one) for one in (health.latency_p50_s, health.latency_p99_s)]
-    lines.append(
-        f"latency **{latency[0]}** median, **{latency[1]}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
-    )
+    memory = f"memory **{health.memory_bytes / 1e6:.0f} MB**"
+    if health.latency_p50_s is not None:
+        median, high = (format_milliseconds(one) for one in (health.latency_p50_s, health.latency_p99_s))
+        memory = f"latency **{median}** median, **{high}** at 99 %, {memory}"
+    lines.append(memory)
     outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
     lines.append(f"up **{format_duration(health.uptime_s)}**{outputs}")
     return "\n".join([*lines[:2], LINE_BREAK.join(lines[2:])])
@@ -155,7 +156,7 @@ def _fleet_problem(one: RemoteDevice, now_s: float) -> str:
     """Return the problems of one device, or "" if there are none."""
     if one.status is None:
         return "no data yet"
-    silent = f"no data for {now_s - one.last_message_s:.1f} s" if one.state(now_s) in ("gone", "silent") else ""
+    silent = f"no data for {now_s - one.last_message_s:.0f} s" if one.state(now_s) in ("gone", "silent") else ""
     return escape_markdown(one.describe_device_problems()) or silent
 
 

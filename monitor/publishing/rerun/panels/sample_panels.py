@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 ROWS_PER_S: Final = 200.0
 BUCKETS_PER_S: Final = 95.0  # a bucket gives two values, or more if it is divided between two batches
 ROWS_PER_FLUSH: Final = 4000  # limit for a fast replay, which delivers hours of samples at once
+MIN_GAP_S: Final = 1.0  # shorter gaps are not visible in a plot of 30 s
+MIN_GAP_INTERVALS: Final = 5.0  # for a sensor with less than five samples per second
 
 
 def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
@@ -87,10 +89,31 @@ def _bucket_ends(order: Ints, bucket: Ints) -> Ints:
     return np.unique(order[first | last])
 
 
+def gap_midpoints(sample_s: Floats, previous_s: float) -> Floats:
+    """Return the middle of each gap, at which the line of the samples is interrupted.
+
+    >>> gap_midpoints(np.array([1.0, 1.1, 1.2, 9.2, 9.3]), 0.9).round(1).tolist()
+    [5.2]
+
+    Parameters
+    ----------
+    sample_s
+        Unix times of the samples [s], shape [n].
+    previous_s
+        Unix time of the sample before [s].
+    """
+    before_s = np.concatenate([[previous_s], sample_s[:-1]])
+    intervals_s = sample_s - before_s
+    gaps = intervals_s > max(MIN_GAP_S, MIN_GAP_INTERVALS * float(np.median(intervals_s)))
+    return np.asarray((before_s + intervals_s / 2.0)[gaps])
+
+
 TEMPERATURES_PER_S: Final = 5.0
 
 
 class _SamplePanel(Panel):
+    _newest_s = float("nan")  # Unix time of the newest sample [s]
+
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
         for axis in axes:
             line = (axis, axis_colours.AXIS_COLOURS[axis], 1.0)
@@ -101,10 +124,16 @@ class _SamplePanel(Panel):
     ) -> Floats:
         """Log decimated samples, and return the times of all samples."""
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        if times.size == 0:
+            return times
+        gaps_s = gap_midpoints(times, times[0] if np.isnan(self._newest_s) else self._newest_s)
+        self._newest_s = float(times[-1])
         for i, axis in enumerate(axes):
             t, y = decimate_extremes(times, values[:, i])
+            t, y = np.concatenate([t, gaps_s]), np.concatenate([y, np.full(gaps_s.size, np.nan)])
+            order = np.argsort(t, kind="stable")
             factor = SAMPLE_UNITS[sensor_kind(axis)].factor
-            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t, y * factor)
+            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t[order], y[order] * factor)
         return times
 
 

@@ -96,6 +96,19 @@ def test_recording_contains_the_shown_results(tmp_path: Path) -> None:
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
 
 
+def test_line_of_the_samples_is_interrupted_at_a_gap(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
+    view.start()
+    wait_for(lambda: view.state == "ok")
+    for begin_s in (T0, T0 + 16.0):
+        view.put("bench-1", begin_s, SampleBatch(*example_results.simulate_samples(begin_s, 1.0)))
+    view.close()
+    gz = read_column_values(read_entities(path)["/bench-1/samples/gz"], "Scalars:scalars")
+    assert np.flatnonzero(np.isnan(gz)).tolist() == [100]
+    assert gz.size == 201
+
+
 def test_state_before_the_first_sample_has_no_time(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
@@ -356,6 +369,19 @@ def test_web_viewer_uses_the_next_free_port_and_releases_it(monkeypatch: pytest.
         assert sinks.is_rerun_server(port)
         view.close()
     assert not sinks.is_listening(port)
+
+
+def test_viewer_program_records_no_usage_statistics(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("CI", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    port, web_port = free_port(), free_port()
+    child = sinks.ViewerProcess(
+        ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
+    )
+    wait_for(lambda: sinks.is_rerun_server(port))
+    child.terminate()
+    assert not list(tmp_path.rglob("*analytics*"))
 
 
 @pytest.mark.long

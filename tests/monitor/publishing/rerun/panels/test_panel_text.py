@@ -20,6 +20,13 @@ def test_health_text_of_a_lost_device_shows_its_state_above_the_reason():
     )
     assert 0 < text.index("## LOST") < text.index("port is gone")
     assert "no samples" in text
+    assert "latency" not in text
+
+
+def test_health_text_of_an_ended_recording_names_the_end_and_no_rate():
+    text = health_text("b", example_results.make_health(state="ended", rate_hz=None, latency_p50_s=None))
+    assert "## ENDED: end of the recording" in text
+    assert "no samples" in text
 
 
 def test_each_coefficient_has_its_unit():
