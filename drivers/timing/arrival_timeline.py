@@ -224,6 +224,8 @@ def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) ->
     missing : array of int64, shape (n,)
         Number of missing samples before each sample.
     """
+    if not missing[1:].any():
+        return [make_block(t_ns, samples.values, samples.temperature_c, samples.ticks, int(missing[0]))]
     edges = [0, *(np.flatnonzero(missing[1:]) + 1).tolist(), len(samples)]
     parts = ((a, samples[a:b]) for a, b in pairwise(edges))
     return [

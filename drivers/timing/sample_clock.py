@@ -220,12 +220,14 @@ class SampleClock:
             return self._sender.split_at_missing_samples(samples)
         timeline = self._timeline
         # A counter needs the whole block, which shows its typical step.
-        by_arrival = self._arrivals_are_timed and (samples.ticks == NO_TICK).all()
+        by_arrival = self._arrivals_are_timed and samples.ticks[0] == NO_TICK and (samples.ticks == NO_TICK).all()
         batches = split_by_arrival_time(samples, timeline.origin_ns or 0) if by_arrival else [samples]
         t_ns, missing = [], []
         for batch in batches:
             missing.append(self._count_missing(batch))
             t_ns.append(timeline.add_arrival_and_assign_times(batch, missing[-1]))
+        if len(t_ns) == 1:
+            return retime_and_split_at_gaps(samples, t_ns[0], missing[0])
         return retime_and_split_at_gaps(samples, np.concatenate(t_ns), np.concatenate(missing))
 
     def _count_missing(self, samples: SampleBlock) -> Ints:
