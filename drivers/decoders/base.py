@@ -527,6 +527,11 @@ def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
         yield key, np.flatnonzero(groups == i)
 
 
+def index_of_rows(rows: Ints, count: int) -> Ints | slice:
+    """Return an index that selects the given rows of an array with ``count`` rows, which is faster for all rows."""
+    return slice(None) if rows.size == count else rows
+
+
 def nan_to_infinity(values: Floats) -> Floats:
     """Replace NaN with infinity, because ``BlockBuilder`` rejects infinite values but treats NaN as not measured."""
     return np.where(np.isnan(values), np.inf, values)

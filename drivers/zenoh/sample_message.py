@@ -11,7 +11,7 @@ sizes are inconsistent or too large raises ``DecodeError``.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -85,10 +85,11 @@ def encode_samples(
     schema
         Name of the message schema.
     """
-    table = np.empty((len(block), len(COLUMNS)), "<f8")
-    table[:, : len(AXES)], table[:, len(AXES)] = block.values, block.temperature_c
-    missing: Any = np.isnan(table).all(axis=0)
+    missing = [*np.isnan(block.values).all(axis=0).tolist(), np.isnan(block.temperature_c).all()]
     measured = [column for column in range(len(COLUMNS)) if not missing[column]] or [*range(len(AXES))]
+    table = block.values.astype("<f8", copy=False)
+    if len(measured) != len(AXES) or not missing[-1]:
+        table = np.column_stack((block.values, block.temperature_c))[:, measured].astype("<f8", copy=False)
     t: float | bytes
     t, t0, rate = _encode_times(block.t_ns + unix_offset_ns)
     return _ENCODER.encode(
@@ -96,7 +97,7 @@ def encode_samples(
             schema=schema,
             device=device,
             axes=[COLUMNS[column] for column in measured],
-            data=table[:, measured].tobytes(),
+            data=table.tobytes(),
             t=t,
             samples=total_samples,
             lost=block.lost,

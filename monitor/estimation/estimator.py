@@ -285,9 +285,10 @@ class Estimator:
             self._theta[:, columns] = one.theta
             for column, (axis, contradicts) in enumerate(zip(axes, axes_contradicting_five_terms(one), strict=True)):
                 self._contradicting[axis] = (table, measured.select_axis(column)) if contradicts else None
-            fits.append(
-                refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
-            )
+            low_passes = [self._low_passes[axis] for axis in axes]
+            if any(low_passes):
+                one, _ = refit_with_low_passes(self._design, table, measured, one, low_passes)
+            fits.append(one)
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, [axis for axes in groups for axis in axes])
         self._entered = result.entered
         return result

@@ -176,19 +176,19 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
             layout = build_message_dtype(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
-            messages = frames.stack_records(rows, layout)
+            messages, at = frames.stack_records(rows, layout), base.index_of_rows(rows, n)
             fields = layout.names or ()
             self._reads_compensated_gyro = _contains_compensated_gyro(header, self._compensated)
             with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
                 if "gyro" in fields:
-                    values[rows, :3] = base.nan_to_infinity(messages["gyro"])
+                    values[at, :3] = base.nan_to_infinity(messages["gyro"])
                 if "accel" in fields:
-                    values[rows, 3:] = base.nan_to_infinity(messages["accel"])
+                    values[at, 3:] = base.nan_to_infinity(messages["accel"])
                 if "temperature" in fields:
                     temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
-                    temperature_c[rows] = messages["temperature"]
+                    temperature_c[at] = messages["temperature"]
             if "time" in fields and self._uses_device_time:
-                ticks[rows] = messages["time"] & TICK_BITS
+                ticks[at] = messages["time"] & TICK_BITS
         blocks, last = self._build_measured_blocks(frames, values, temperature_c, ticks)
         if last is not None:
             self._time_missing = self._uses_device_time and int(ticks[last]) == NO_TICK
