@@ -93,8 +93,8 @@ class CounterGaps:
         ticks_per_sample = self._ticks_per_sample()
         regular = near_typical and not first and self._counts_single_samples(ticks_per_sample)
         if not first and ticks_per_sample is not None:
-            counted = len(samples) if regular else int(np.rint(steps / ticks_per_sample).sum())
-            wraps = self._hidden_wraps(counted, ticks_per_sample, arrived_ns, link_was_closed)
+            samples_by_ticks = len(samples) if regular else int(np.rint(steps / ticks_per_sample).sum())
+            wraps = self._hidden_wraps(samples_by_ticks, ticks_per_sample, arrived_ns, link_was_closed)
             steps[0] += counter.modulus * wraps
             regular = regular and not wraps
         self._tick = int(samples.ticks[-1])

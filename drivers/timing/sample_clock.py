@@ -115,7 +115,7 @@ class SampleClock:
         """
         if self._check is not None:
             return self._check.rate_hz
-        if not self._timeline.line.has_enough_points_for_gaps():
+        if not self._timeline.line.has_enough_points_for_gaps:
             return self._timeline.assumed_hz
         measured = self._timeline.line.rate_hz()
         return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
@@ -123,7 +123,7 @@ class SampleClock:
     @property
     def measured_hz(self) -> float | None:
         """Sample rate in Hz measured with the clock of the host, or None if unknown."""
-        return self._timeline.line.rate_hz() if self._timeline.line.has_enough_points_for_gaps() else None
+        return self._timeline.line.rate_hz() if self._timeline.line.has_enough_points_for_gaps else None
 
     @property
     def contradicting_rate_hz(self) -> float | None:

@@ -11,7 +11,7 @@ sizes are inconsistent or too large raises ``DecodeError``.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
@@ -85,7 +85,8 @@ def encode_samples(
     schema
         Name of the message schema.
     """
-    missing = [*np.isnan(block.values).all(axis=0).tolist(), np.isnan(block.temperature_c).all()]
+    without_axis: Any = np.isnan(block.values).all(axis=0)
+    missing = [*without_axis.tolist(), bool(np.isnan(block.temperature_c).all())]
     measured = [column for column in range(len(COLUMNS)) if not missing[column]] or [*range(len(AXES))]
     table = block.values.astype("<f8", copy=False)
     if len(measured) != len(AXES) or not missing[-1]:

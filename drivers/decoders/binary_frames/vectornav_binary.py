@@ -195,18 +195,19 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return blocks
 
     def _match_message(self, buffer: bytes, at: int) -> int:
-        if len(buffer) < at + 2:
+        have = len(buffer) - at
+        if have < 2:
             return base.NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
         if not header_end:
             return base.REJECT
-        if len(buffer) < at + header_end:
+        if have < header_end:
             return base.NEED_MORE
         layout = build_message_dtype(buffer[at + 1 : at + header_end], self._compensated)
         if layout is None:
             return base.REJECT
         length = layout.itemsize
-        if len(buffer) < at + length:
+        if have < length:
             return base.NEED_MORE
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 

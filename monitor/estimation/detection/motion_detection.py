@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block
+from drivers.data_types import AXES, Floats, Ints, SampleBlock
 from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
@@ -122,7 +122,7 @@ class MotionDetector:
             return samples
         self.samples_in_motion += int(struck.sum())
         values = np.where(struck[:, None], np.nan, samples.values)
-        return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+        return samples.with_values(values)
 
 
 def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[MotionEpisode]]:
