@@ -73,6 +73,16 @@ class SampleBlock:
             self.lost if first == 0 else 0,
         )
 
+    def with_times(self, t_ns: Ints, lost: int) -> "SampleBlock":
+        """Return the samples with other times, which become read-only, and another number of missing samples."""
+        t_ns.flags.writeable = False
+        return SampleBlock(t_ns, self.values, self.temperature_c, self.ticks, lost)
+
+    def with_values(self, values: Floats) -> "SampleBlock":
+        """Return the samples with other values in a contiguous array, which becomes read-only."""
+        values.flags.writeable = False
+        return SampleBlock(self.t_ns, values, self.temperature_c, self.ticks, self.lost)
+
 
 def make_block(
     t_ns: Ints,
@@ -180,6 +190,8 @@ def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
 
 def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
     """Concatenate consecutive blocks between which no samples are missing."""
+    if len(blocks) == 1:
+        return [*blocks]
     edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
     return [blocks[a] if b - a == 1 else concatenate_blocks(blocks[a:b]) for a, b in pairwise(edges)]
 

@@ -170,13 +170,13 @@ class BlockBuilder:
         bad_after
             Number of frames that were rejected after the last sample. The next block counts these frames as missing.
         """
+        block = self.build_block_if_all_plausible(t_ns, values, temperature_c, ticks, bad_before, bad_after)
+        if block is not None:
+            return [block]
         n = t_ns.size
         temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
         good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
-        if n and good.all() and (bad_before is None or not bad_before.any()):  # usually every sample is plausible
-            self.bad += bad_after
-            return [make_block(t_ns, values, temperature_c, ticks, carried)]
         bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
         ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
         temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
@@ -197,17 +197,37 @@ class BlockBuilder:
             for first, rows in zip((0, *cuts), np.split(kept, cuts), strict=True)
         ]
 
+    def build_block_if_all_plausible(
+        self,
+        t_ns: Ints,
+        values: Floats,
+        temperature_c: Floats | None = None,
+        ticks: Ints | None = None,
+        bad_before: Ints | None = None,
+        bad_after: int = 0,
+    ) -> SampleBlock | None:
+        """Build one block of all samples, or return None unless every value is measured and plausible, as usual.
+
+        The result is also None if frames were rejected before a sample. The parameters are those of
+        ``build_plausible_blocks``.
+        """
+        if not t_ns.size or (bad_before is not None and bad_before.any()) or not (np.abs(values) <= VALUE_LIMITS).all():
+            return None
+        temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
+        block = make_block(t_ns, values, temperature_c, ticks, self._missing)
+        self._missing = bad_after
+        self.bad += bad_after
+        return block
+
 
 def _find_plausible(values: Floats) -> NDArray[np.bool_]:
     """Return a mask [n] that is True for each plausible sample in ``values`` [n, 6].
 
     A plausible sample has at least one measured axis, and every measured value is within the range of MEMS IMUs.
     """
-    within_limits = np.abs(values) <= VALUE_LIMITS
-    if within_limits.all():  # usually every axis is measured
-        return np.ones(len(values), np.bool_)
     unmeasured = np.isnan(values)
-    plausible: NDArray[np.bool_] = np.all(within_limits | unmeasured, axis=1) & ~np.all(unmeasured, axis=1)
+    allowed = (np.abs(values) <= VALUE_LIMITS) | unmeasured
+    plausible: NDArray[np.bool_] = np.all(allowed, axis=1) & ~np.all(unmeasured, axis=1)
     return plausible
 
 
@@ -463,14 +483,22 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
         return self._decode(frames) if frames.data else []
 
     def _build_measured_blocks(
-        self, frames: RawFrames, values: Floats, temperature_c: Floats, ticks: Ints
+        self, frames: RawFrames, values: Floats, temperature_c: Floats | None, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
+        """Build blocks of the frames that contain a measured axis; also return the index of the last such frame."""
+        block = self._builder.build_block_if_all_plausible(
+            frames.t_ns, values, temperature_c, ticks, frames.bad_before, frames.bad_after
+        )
+        if block is not None:
+            self._frames_without_sample = 0
+            return [block], len(values) - 1
         rows = np.nonzero(~np.isnan(values).all(axis=1))[0]
         earlier = 0 if rows.size else self._frames_without_sample
         self._frames_without_sample = earlier + len(values) - 1 - (int(rows[-1]) if rows.size else -1)
         if rows.size < len(values):
             frames = frames.select_frames(rows.tolist())
-            values, temperature_c, ticks = values[rows], temperature_c[rows], ticks[rows]
+            values, ticks = values[rows], ticks[rows]
+            temperature_c = None if temperature_c is None else temperature_c[rows]
         blocks = self._builder.build_plausible_blocks(
             frames.t_ns, values, temperature_c, ticks, frames.bad_before, frames.bad_after
         )
@@ -497,6 +525,11 @@ def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
     groups = np.array([distinct[key] for key in keys])
     for key, i in distinct.items():
         yield key, np.flatnonzero(groups == i)
+
+
+def index_of_rows(rows: Ints, count: int) -> Ints | slice:
+    """Return an index that selects the given rows of an array with ``count`` rows, which is faster for all rows."""
+    return slice(None) if rows.size == count else rows
 
 
 def nan_to_infinity(values: Floats) -> Floats:

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
+from drivers.host.wake_signal import WakeSignal
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.links.periodic_request import PeriodicRequest, parse_request
 from drivers.validation.module_lookup import format_choices_by_similarity
@@ -102,6 +103,8 @@ class SerialLink(PolledLink):
         self._read_timeout_s = settings.read_timeout or DEFAULT_READ_TIMEOUT_S
         self._port: serial.SerialBase | None = None
         self._requests: PeriodicRequest | None = None
+        self._file_number: int | None = None  # None if the port cannot be read through a file descriptor
+        self._interrupt = WakeSignal()  # interrupts the wait for more bytes
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def set_default_read_timeout(self, timeout_s: float) -> None:
@@ -111,6 +114,7 @@ class SerialLink(PolledLink):
     def close(self) -> None:
         """Interrupt a waiting call of ``wait_for_chunks_or_timeout``, then close the port."""
         self._closing.set()
+        self._interrupt.set()
         cancel = getattr(self._port, "cancel_read", None)  # some URL handlers lack this method
         if cancel is not None:
             # An error means that the port has just been closed, so no read is waiting.
@@ -138,6 +142,8 @@ class SerialLink(PolledLink):
                 # URL handlers that cannot lock a port ignore this key.
                 **({"exclusive": True} if s.exclusive else {}),
             )
+            self._file_number = self._port.fileno() if _has_file_number(self._port) else None
+            self._interrupt.wait_and_clear(0.0)
             if s.first_request:
                 self._port.write(parse_request(s.first_request))
         except (OSError, ValueError, NotImplementedError) as error:
@@ -154,17 +160,19 @@ class SerialLink(PolledLink):
         port = self._port
         assert port is not None
         try:
-            if not _has_file_number(port):
+            if self._file_number is None:
                 data: bytes = port.read(READ_BYTES)
                 return data
-            if not self._buffer_filling and self._closing.wait(self._read_timeout_s):
+            if not self._buffer_filling and self._interrupt.wait_and_clear(self._read_timeout_s):
                 return b""
             data = b""
-            with contextlib.suppress(BlockingIOError):  # no more bytes have arrived
-                while len(data) <= MAX_WAITING_BYTES and (more := os.read(port.fileno(), READ_BYTES)):
+            try:
+                while len(data) <= MAX_WAITING_BYTES and (more := os.read(self._file_number, READ_BYTES)):
                     data += more
                     if len(more) < READ_BYTES // 2:  # the buffer of the terminal is empty
                         break
+            except BlockingIOError:  # no more bytes have arrived
+                pass
             self._buffer_filling = len(data) > MAX_WAITING_BYTES
             if not data:
                 data = port.read(1)

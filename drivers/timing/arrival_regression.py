@@ -44,6 +44,8 @@ class ArrivalRegression:
 
     def __init__(self) -> None:
         self.count = 0
+        self.has_enough_points_for_gaps = False
+        """True if the regression has enough points to distinguish a gap from jitter."""
         self._x0 = self._t0 = 0.0  # index and time of the newest point
         self._first_x = self._first_t = 0.0
         self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
@@ -79,19 +81,14 @@ class ArrivalRegression:
         self._sxt += (1.0 - gain) * ex * et
         self._stt += (1.0 - gain) * et * et
         self.count += 1
+        self.has_enough_points_for_gaps = (
+            self._x0 - self._first_x >= MIN_SAMPLES and self._t0 - self._first_t >= MIN_SPAN_S
+        )
 
     def shift_points(self, samples: float) -> None:
         """Increase the index of all points after samples were found to be missing before the first point."""
         self._x0 += samples
         self._first_x += samples
-
-    def elapsed_s(self) -> float:
-        """Return the time from the first to the newest point in seconds."""
-        return self._t0 - self._first_t
-
-    def has_enough_points_for_gaps(self) -> bool:
-        """Return True if the regression has enough points to distinguish a gap from jitter."""
-        return self._x0 - self._first_x >= MIN_SAMPLES and self.elapsed_s() >= MIN_SPAN_S
 
     def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
         """Return the measured sample rate and its uncertainty.
@@ -113,7 +110,7 @@ class ArrivalRegression:
         enough = (
             self._x0 - self._first_x >= MIN_SAMPLES - 1
             if final
-            else self.has_enough_points_for_gaps() and self.count >= MIN_POINTS
+            else self.has_enough_points_for_gaps and self.count >= MIN_POINTS
         )
         if not enough or not self._sxt > 0.0:
             return None
@@ -127,7 +124,7 @@ class ArrivalRegression:
 
     def period_s(self) -> float | None:
         """Return the sample period in seconds. None if there is no nominal rate and there are too few points."""
-        if self.count >= 2 and self._sxt > 0.0 and (self.has_enough_points_for_gaps() or self._nominal_s is None):
+        if self.count >= 2 and self._sxt > 0.0 and (self.has_enough_points_for_gaps or self._nominal_s is None):
             return self._sxt / self._sxx
         return self._nominal_s if self.count else None
 

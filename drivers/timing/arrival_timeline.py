@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.data_types import NS_PER_S, Ints, SampleBlock, make_block
+from drivers.data_types import NS_PER_S, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.newest_sample_time_lower_bound import NewestSampleTimeLowerBound
 
@@ -155,7 +155,7 @@ class ArrivalTimeline:
             Minimum number of consecutive missing samples to detect.
         """
         period_s = self.line.period_s()
-        if period_s is None or not self.line.has_enough_points_for_gaps():
+        if period_s is None or not self.line.has_enough_points_for_gaps:
             return 0
         least_s = max(min_gap_samples * period_s, MIN_GAP_S)
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
@@ -224,9 +224,8 @@ def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) ->
     missing : array of int64, shape (n,)
         Number of missing samples before each sample.
     """
+    if not missing[1:].any():
+        return [samples.with_times(t_ns, int(missing[0]))]
     edges = [0, *(np.flatnonzero(missing[1:]) + 1).tolist(), len(samples)]
     parts = ((a, samples[a:b]) for a, b in pairwise(edges))
-    return [
-        make_block(t_ns[a : a + len(one)].copy(), one.values, one.temperature_c, one.ticks, int(missing[a]))
-        for a, one in parts
-    ]
+    return [one.with_times(t_ns[a : a + len(one)].copy(), int(missing[a])) for a, one in parts]

@@ -26,6 +26,9 @@ STEP_HISTORY: Final = 255
 """Number of recent counter steps from which the typical step is determined."""
 STEP_TOLERANCE: Final = 0.25
 """Maximum relative difference between a counter step and the typical step."""
+RATE_TOLERANCE: Final = 0.1
+"""Relative difference between the nominal and the typical step up to which a step near the typical one counts as one
+sample."""
 
 
 class CounterGaps:
@@ -86,11 +89,17 @@ class CounterGaps:
         steps[0] = samples.ticks[0] - previous % counter.modulus
         np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
         steps %= counter.modulus
-        self.typical_step.add_steps(steps)
+        near_typical = self.typical_step.add_steps(steps)
         ticks_per_sample = self._ticks_per_sample()
-        if not first:
-            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, link_was_closed)
+        regular = near_typical and not first and self._counts_single_samples(ticks_per_sample)
+        if not first and ticks_per_sample is not None:
+            samples_by_ticks = len(samples) if regular else int(np.rint(steps / ticks_per_sample).sum())
+            wraps = self._hidden_wraps(samples_by_ticks, ticks_per_sample, arrived_ns, link_was_closed)
+            steps[0] += counter.modulus * wraps
+            regular = regular and not wraps
         self._tick = int(samples.ticks[-1])
+        if regular:
+            return self._advance_device_clock(steps, np.zeros(len(samples), np.int64))
         waited = self._find_stuck_counter(samples, steps[1:] if first else steps)
         missing = np.zeros(len(samples), np.int64)
         if ticks_per_sample is not None:
@@ -105,11 +114,22 @@ class CounterGaps:
             self._discard_jump(samples, missing, steps, first)
         if first:
             missing[0] = max(samples.lost, unseen)
-        if counter.tick_s is not None:
-            self._clock_s += float(steps.sum()) * counter.tick_s
-            self._clock_index += len(samples) + int(missing.sum())
+        return self._advance_device_clock(steps, missing)
+
+    def _advance_device_clock(self, steps: Ints, missing: Ints) -> Ints:
+        """Add the newest sample to the regression of device time, and return ``missing``."""
+        if self._counter.tick_s is not None:
+            self._clock_s += float(steps.sum()) * self._counter.tick_s
+            self._clock_index += len(steps) + int(missing.sum())
             self.clock_line.add_point(self._clock_index, self._clock_s)
         return missing
+
+    def _counts_single_samples(self, ticks_per_sample: float | None) -> bool:
+        """Return True if steps near the typical step mean that no sample is missing and that the counter works."""
+        typical = self.typical_step.mean_ticks_per_sample
+        if self._stuck or not typical or ticks_per_sample is None or self._sample_period_s() is None:
+            return False
+        return abs(ticks_per_sample / typical - 1.0) < RATE_TOLERANCE
 
     def _discard_jump(self, samples: SampleBlock, missing: Ints, steps: Ints, first: bool) -> None:
         """Report a counter jump, and correct ``missing`` and ``steps`` in place from arrival times."""
@@ -135,17 +155,20 @@ class CounterGaps:
         # If the nominal rate does not match the typical step, the typical step is used.
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
-    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, link_was_closed: bool) -> int:
-        """Estimate how many additional times the counter has wrapped during a pause of the data."""
-        if ticks_per_sample is None:
-            return 0
+    def _sample_period_s(self) -> float | None:
+        return self._timeline.earliest_time.period_s or self._timeline.undelayed_period_s()
+
+    def _hidden_wraps(self, counted: int, ticks_per_sample: float, arrived_ns: int, link_was_closed: bool) -> int:
+        """Estimate how many additional times the counter has wrapped during a pause of the data.
+
+        ``counted`` is the number of samples according to the counter steps.
+        """
         counter, timeline = self._counter, self._timeline
         by_ticks_hz = 1.0 / (ticks_per_sample * counter.tick_s) if counter.tick_s else timeline.assumed_hz
         rate_hz = timeline.line.rate_hz() or by_ticks_hz
         if rate_hz is None:
             return 0
         turn = counter.modulus / ticks_per_sample  # number of samples per wrap of the counter
-        counted = int(np.rint(steps / ticks_per_sample).sum())
         if link_was_closed:
             timeline.forget_delay()
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
@@ -177,7 +200,7 @@ class CounterGaps:
         have arrived late.
         """
         counter, timeline = self._counter, self._timeline
-        period_s = timeline.earliest_time.period_s or timeline.undelayed_period_s()
+        period_s = self._sample_period_s()
         lost = float(missing.sum(dtype=np.float64))
         lasted_s = lost / MAX_RATE_HZ
         if period_s is not None:
@@ -203,8 +226,13 @@ class _TypicalStep:
         """Mean number of ticks per sample, or None before the counter has advanced."""
         return self._sum / self._count if self._count else None
 
-    def add_steps(self, steps: Ints) -> None:
-        """Add counter steps to the mean. Steps of zero are ignored."""
+    def add_steps(self, steps: Ints) -> bool:
+        """Add counter steps to the mean, and return True if all of them are near it. Steps of zero are ignored."""
+        mean = self.mean_ticks_per_sample
+        if mean is not None and (np.abs(steps / mean - 1.0) < STEP_TOLERANCE).all():
+            self._recent.extend(steps[-STEP_HISTORY:].tolist())
+            self._add_to_mean(steps)
+            return True
         moved = steps[steps > 0]
         self._recent.extend(moved[-STEP_HISTORY:].tolist())
         near = self._near(moved)
@@ -214,6 +242,7 @@ class _TypicalStep:
             if 2 * self._near(recent).size < recent.size:  # start again if most recent steps differ
                 self._sum = self._count = 0
                 self._add_to_mean(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
+        return False
 
     def _add_to_mean(self, steps: Ints) -> None:
         self._sum += int(steps.sum())

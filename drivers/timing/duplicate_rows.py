@@ -72,8 +72,8 @@ class DuplicateDetector:
         n = len(keys)
         fresh = int(keys[0]) > self._last if self._ordered else int(keys[0]) != self._last
         if n > 1 and fresh:
-            steps = np.diff(keys)
-            fresh = bool((steps > 0).all() if self._ordered else (steps != 0).all())
+            later, earlier = keys[1:], keys[:-1]
+            fresh = bool((later > earlier).all() if self._ordered else (later != earlier).all())
         newest = int(keys[-1])
         if self._ordered and newest > self._last - NS_PER_S:  # otherwise the sender clock was set back
             newest = max(self._last, newest if n == 1 else int(keys.max()))

@@ -115,7 +115,7 @@ class SampleClock:
         """
         if self._check is not None:
             return self._check.rate_hz
-        if not self._timeline.line.has_enough_points_for_gaps():
+        if not self._timeline.line.has_enough_points_for_gaps:
             return self._timeline.assumed_hz
         measured = self._timeline.line.rate_hz()
         return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
@@ -123,7 +123,7 @@ class SampleClock:
     @property
     def measured_hz(self) -> float | None:
         """Sample rate in Hz measured with the clock of the host, or None if unknown."""
-        return self._timeline.line.rate_hz() if self._timeline.line.has_enough_points_for_gaps() else None
+        return self._timeline.line.rate_hz() if self._timeline.line.has_enough_points_for_gaps else None
 
     @property
     def contradicting_rate_hz(self) -> float | None:
@@ -220,12 +220,14 @@ class SampleClock:
             return self._sender.split_at_missing_samples(samples)
         timeline = self._timeline
         # A counter needs the whole block, which shows its typical step.
-        by_arrival = self._arrivals_are_timed and (samples.ticks == NO_TICK).all()
+        by_arrival = self._arrivals_are_timed and samples.ticks[0] == NO_TICK and (samples.ticks == NO_TICK).all()
         batches = split_by_arrival_time(samples, timeline.origin_ns or 0) if by_arrival else [samples]
         t_ns, missing = [], []
         for batch in batches:
             missing.append(self._count_missing(batch))
             t_ns.append(timeline.add_arrival_and_assign_times(batch, missing[-1]))
+        if len(t_ns) == 1:
+            return retime_and_split_at_gaps(samples, t_ns[0], missing[0])
         return retime_and_split_at_gaps(samples, np.concatenate(t_ns), np.concatenate(missing))
 
     def _count_missing(self, samples: SampleBlock) -> Ints:

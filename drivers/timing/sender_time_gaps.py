@@ -124,7 +124,7 @@ class SenderTimeGapDetector:
 
     def _period_s(self, steps: Ints) -> float | None:
         """Return the sample period in s that is used to detect missing samples, or None if unknown."""
-        if self._timeline.line.has_enough_points_for_gaps():
+        if self._timeline.line.has_enough_points_for_gaps:
             return self._timeline.line.period_s()
         if self._timeline.assumed_hz:
             return 1.0 / self._timeline.assumed_hz

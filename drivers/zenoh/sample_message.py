@@ -85,10 +85,12 @@ def encode_samples(
     schema
         Name of the message schema.
     """
-    table = np.empty((len(block), len(COLUMNS)), "<f8")
-    table[:, : len(AXES)], table[:, len(AXES)] = block.values, block.temperature_c
-    missing: Any = np.isnan(table).all(axis=0)
+    without_axis: Any = np.isnan(block.values).all(axis=0)
+    missing = [*without_axis.tolist(), bool(np.isnan(block.temperature_c).all())]
     measured = [column for column in range(len(COLUMNS)) if not missing[column]] or [*range(len(AXES))]
+    table = block.values.astype("<f8", copy=False)
+    if len(measured) != len(AXES) or not missing[-1]:
+        table = np.column_stack((block.values, block.temperature_c))[:, measured].astype("<f8", copy=False)
     t: float | bytes
     t, t0, rate = _encode_times(block.t_ns + unix_offset_ns)
     return _ENCODER.encode(
@@ -96,7 +98,7 @@ def encode_samples(
             schema=schema,
             device=device,
             axes=[COLUMNS[column] for column in measured],
-            data=table[:, measured].tobytes(),
+            data=table.tobytes(),
             t=t,
             samples=total_samples,
             lost=block.lost,

@@ -16,6 +16,7 @@ import structlog
 
 from drivers.data_types import SenderTimedFormat
 from drivers.errors import ConfigError
+from drivers.host.wake_signal import WakeSignal
 from monitor.common.device_health import Health, format_service_status
 from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.daemon.config_changes import ConfigChange
@@ -76,7 +77,7 @@ class DaemonProcess:
         self._writers = dict(writers or {})
         self._unit = unit or SystemdNotifier()
         self._started_s = time.monotonic()
-        self._wake = threading.Event()
+        self._wake = WakeSignal()
         self._stop = threading.Event()
         self._reload_asked = False
         storage = config.storage

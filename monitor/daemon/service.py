@@ -102,8 +102,7 @@ class Service(DaemonProcess):
                 output.set_alive(device, samples_arrive)
 
     def _wait(self, round_start_s: float) -> None:
-        self._wake.wait(MAX_IDLE_S)
-        self._wake.clear()
+        self._wake.wait_and_clear(MAX_IDLE_S)
         pause_s = round_start_s + ROUND_PAUSE_S - time.monotonic()
         if pause_s > 0.0 and not any(worker.device.publish_s == 0.0 for worker in self.workers):
             self._stop.wait(pause_s)

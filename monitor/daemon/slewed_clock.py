@@ -40,6 +40,7 @@ class SlewedClock:
         self._slewed_at_ns = monotonic_ns
         # [n, 3] start, initial offset and remaining correction of each slew; replaced as a whole for the reader threads
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
+        self._newest_knot = (monotonic_ns, self._host_ns, 0)
 
     @property
     def lag_behind_host_ns(self) -> int:
@@ -55,26 +56,36 @@ class SlewedClock:
             Step of the host clock since the last call, in nanoseconds.
         """
         before_ns, self._host_ns = self._host_ns, unix_ns - monotonic_ns
-        begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
+        begun_ns, offset_ns, correction_ns = self._newest_knot
         self._slewed_at_ns = max(monotonic_ns, begun_ns)
         if offset_ns + correction_ns != self._host_ns:
             now_ns = self.unix_offset_ns(self._slewed_at_ns)
-            knot = np.array([[self._slewed_at_ns, now_ns, self._host_ns - now_ns]], np.int64)
+            knot = (self._slewed_at_ns, now_ns, self._host_ns - now_ns)
             kept = self._knots[:-1] if self._slewed_at_ns == begun_ns else self._knots
-            self._knots = np.concatenate([kept[1 - MAX_KNOTS :], knot])
+            self._knots = np.concatenate([kept[1 - MAX_KNOTS :], np.array([knot], np.int64)])
+            self._newest_knot = knot
         return self._host_ns - before_ns
 
     def unix_offset_ns(self, monotonic_ns: int) -> int:
         """Return the offset from a monotonic time to the Unix time, in nanoseconds."""
-        offsets = self.unix_offsets_ns(np.array([monotonic_ns], np.int64))
-        return offsets if isinstance(offsets, int) else int(offsets[0])
+        offset_ns = self._offset_after_correction_ns(monotonic_ns)
+        if offset_ns is None:
+            return int(self._slewed_offsets_ns(np.array([monotonic_ns], np.int64))[0])
+        return offset_ns
 
     def unix_offsets_ns(self, monotonic_ns: Ints) -> Ints | int:
         """Return the offsets [n] from increasing monotonic times to Unix times in nanoseconds, or one common offset."""
+        offset_ns = self._offset_after_correction_ns(int(monotonic_ns[0]))
+        return self._slewed_offsets_ns(monotonic_ns) if offset_ns is None else offset_ns
+
+    def _offset_after_correction_ns(self, first_ns: int) -> int | None:
+        """Return the offset of all times from ``first_ns``, or None if the newest correction has not ended by then."""
+        begun_ns, offset_ns, correction_ns = self._newest_knot
+        ended = MAX_SLEW_RATE * (first_ns - begun_ns) >= abs(correction_ns) + 1
+        return offset_ns + correction_ns if ended else None
+
+    def _slewed_offsets_ns(self, monotonic_ns: Ints) -> Ints:
         knots = self._knots
-        newest_begun_ns, newest_offset_ns, newest_correction_ns = knots[-1].tolist()
-        if MAX_SLEW_RATE * (int(monotonic_ns[0]) - newest_begun_ns) >= abs(newest_correction_ns) + 1:
-            return int(newest_offset_ns + newest_correction_ns)  # the correction ended before the first time
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
         most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)
         offsets: Ints = offset_ns + np.clip(correction_ns, -most_ns, most_ns)

@@ -217,7 +217,7 @@ class Estimator:
         n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
-        avar, terms = self._window.avar(), self._window.term_counts()
+        avar, terms = self._window.variances_and_terms()
         own, recent = slice(0, self._m), slice(self._m, None)
         result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
         edf = np.concatenate([result.edf, self._spans.edf(result.theta, self.rate_hz, terms[recent])])
@@ -269,8 +269,8 @@ class Estimator:
         filled = self._window.samples_in_window
         np.minimum(self._lengths, filled, out=self._lengths)
         lengths = self._lengths.tolist()
-        slope, slopes = self._window.drift_slopes_by_axis_and_tau(self._lengths)
-        slope, slopes = slope * self.rate_hz, slopes[: self._m] * self.rate_hz
+        slope, slopes = self._window.drift_slopes_by_axis_and_tau(self._lengths, self._m)
+        slope, slopes = slope * self.rate_hz, slopes * self.rate_hz
         before = self._entered if self._refit is None else self._refit.terms_in_fit
         whole = [axis for axis, n in enumerate(lengths) if n == filled]
         groups = [axes for axes in (whole, *([axis] for axis, n in enumerate(lengths) if n < filled)) if axes]
@@ -285,9 +285,10 @@ class Estimator:
             self._theta[:, columns] = one.theta
             for column, (axis, contradicts) in enumerate(zip(axes, axes_contradicting_five_terms(one), strict=True)):
                 self._contradicting[axis] = (table, measured.select_axis(column)) if contradicts else None
-            fits.append(
-                refit_with_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
-            )
+            low_passes = [self._low_passes[axis] for axis in axes]
+            if any(low_passes):
+                one, _ = refit_with_low_passes(self._design, table, measured, one, low_passes)
+            fits.append(one)
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, [axis for axes in groups for axis in axes])
         self._entered = result.entered
         return result

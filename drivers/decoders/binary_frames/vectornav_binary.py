@@ -22,7 +22,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, Timing
+from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.validation.settings_model import SettingsModel
 
@@ -48,6 +48,8 @@ TICKS: Final = 1 << 62
 
 TimeStartup is an unsigned 64-bit integer. Its lowest 62 bits fit into int64 and wrap after 146 years.
 """
+
+TICK_BITS: Final = np.uint64(TICKS - 1)
 
 
 class Settings(SettingsModel):
@@ -169,41 +171,43 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
     def _decode(self, frames: base.RawFrames) -> list[SampleBlock]:
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
-        temperature_c = np.full(n, np.nan)
+        temperature_c: Floats | None = None
         ticks = np.full(n, NO_TICK, np.int64)
         for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
             layout = build_message_dtype(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
-            messages = frames.stack_records(rows, layout)
+            messages, at = frames.stack_records(rows, layout), base.index_of_rows(rows, n)
             fields = layout.names or ()
             self._reads_compensated_gyro = _contains_compensated_gyro(header, self._compensated)
             with np.errstate(invalid="ignore"):  # converting a signalling NaN causes a warning
                 if "gyro" in fields:
-                    values[rows, :3] = base.nan_to_infinity(messages["gyro"])
+                    values[at, :3] = base.nan_to_infinity(messages["gyro"])
                 if "accel" in fields:
-                    values[rows, 3:] = base.nan_to_infinity(messages["accel"])
+                    values[at, 3:] = base.nan_to_infinity(messages["accel"])
                 if "temperature" in fields:
-                    temperature_c[rows] = messages["temperature"]
+                    temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
+                    temperature_c[at] = messages["temperature"]
             if "time" in fields and self._uses_device_time:
-                ticks[rows] = messages["time"] & np.uint64(TICKS - 1)
+                ticks[at] = messages["time"] & TICK_BITS
         blocks, last = self._build_measured_blocks(frames, values, temperature_c, ticks)
         if last is not None:
             self._time_missing = self._uses_device_time and int(ticks[last]) == NO_TICK
         return blocks
 
     def _match_message(self, buffer: bytes, at: int) -> int:
-        if len(buffer) < at + 2:
+        have = len(buffer) - at
+        if have < 2:
             return base.NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
         if not header_end:
             return base.REJECT
-        if len(buffer) < at + header_end:
+        if have < header_end:
             return base.NEED_MORE
         layout = build_message_dtype(buffer[at + 1 : at + header_end], self._compensated)
         if layout is None:
             return base.REJECT
         length = layout.itemsize
-        if len(buffer) < at + length:
+        if have < length:
             return base.NEED_MORE
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 

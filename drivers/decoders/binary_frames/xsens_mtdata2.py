@@ -153,17 +153,18 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
         for layout, rows, packets in _group_by_layout(frames):
+            own = base.index_of_rows(rows, n)
             if layout is None:
-                values[rows] = np.inf
+                values[own] = np.inf
                 continue
             for data_id, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
                 if found := layout.locate_numbers(data_id, 3):
-                    values[rows, axes] = base.nan_to_infinity(_read_numbers(packets, *found, 3))
+                    values[own, axes] = base.nan_to_infinity(_read_numbers(packets, *found, 3))
             if found := layout.locate_numbers(TEMPERATURE, 1):
-                temperature_c[rows] = _read_numbers(packets, *found, 1)[:, 0]
+                temperature_c[own] = _read_numbers(packets, *found, 1)[:, 0]
             if self._clock and (at := layout.locate_integer(self._clock, self._clock_size)):
                 weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
-                ticks[rows] = packets[:, at : at + self._clock_size].astype(np.int64) @ weights
+                ticks[own] = packets[:, at : at + self._clock_size].astype(np.int64) @ weights
         blocks, last = self._build_measured_blocks(frames, values, self._fill_temperatures(temperature_c), ticks)
         if last is not None:
             self._clock_missing = self._clock != 0 and int(ticks[last]) == NO_TICK
@@ -205,6 +206,9 @@ def _group_by_layout(frames: base.RawFrames) -> Iterator[tuple[PacketLayout | No
             layout = _parse_layout(packets[0].tobytes())
             compared = list(layout.header_offsets) if layout else slice(None)
             same = (packets[:, compared] == packets[0, compared]).all(axis=1)
+            if same.all():  # usually all packets have the same layout
+                yield layout, at, packets
+                break
             yield layout, at[same], packets[same]
             at, packets = at[~same], packets[~same]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from drivers.data_types import Chunk, Floats, SampleBlock
 from drivers.driver import Driver
+from drivers.host.wake_signal import WakeSignal
 from drivers.links.base import BatchingLink, Link
 from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
@@ -65,8 +66,8 @@ class DeviceWorker:
         Link from which the samples are read.
     outputs : sequence of Output
         Receivers of the results.
-    wake : threading.Event
-        Event that is set when samples have arrived.
+    wake : WakeSignal
+        Signal that is set when samples have arrived.
     ready : KernelReadiness
         Flags of the compiled kernels. Samples wait until the required kernels are compiled.
     recorder : Recorder, optional
@@ -85,7 +86,7 @@ class DeviceWorker:
         device: Device,
         link: Link,
         outputs: Sequence[Output],
-        wake: threading.Event,
+        wake: WakeSignal,
         ready: KernelReadiness,
         recorder: Recorder | None = None,
         simulated: "SimulatedDevice | None" = None,

@@ -35,9 +35,11 @@ def _samples(n: int) -> SampleBlock:
 
 
 def _call_window() -> None:
+    from monitor.estimation.allan.window import AllanWindow
     from monitor.estimation.estimator import Estimator
 
     Estimator(100.0, 1.0).add_samples(_samples(100))
+    AllanWindow(100, np.array([1])).avar()  # the first estimates are published before the kernels of the fit are ready
 
 
 def _call_fit() -> None:

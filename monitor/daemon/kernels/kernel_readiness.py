@@ -7,6 +7,7 @@ from typing import Final
 
 import structlog
 
+from drivers.host.wake_signal import WakeSignal
 from monitor.daemon.kernels import kernel_compilation, kernel_groups
 
 MAX_INTERPRETED_HZ: Final = 250.0
@@ -37,7 +38,7 @@ class KernelReadiness:
         self.interpretable_hz -= rate_hz
         return True
 
-    def compile_kernels(self, wake: threading.Event) -> None:
+    def compile_kernels(self, wake: WakeSignal) -> None:
         """Compile the kernels, and set a flag and ``wake`` for each compiled part.
 
         All flags are set even if the compilation fails, because the main loop would otherwise wait forever.

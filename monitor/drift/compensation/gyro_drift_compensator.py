@@ -136,6 +136,7 @@ class Compensator:
     def __init__(self, rate_hz: float, adapts: bool = True, orders: Sequence[Order] = ORDERS) -> None:
         self.rate_hz = rate_hz
         self.block_samples = samples_per_block(rate_hz)
+        self.interval_samples = BLOCKS_PER_INTERVAL * self.block_samples  # number of samples in an interval
         self.models: list[ArmaModel | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _initial_state(rate_hz, adapts)
@@ -146,11 +147,6 @@ class Compensator:
         self._at_rest = np.zeros(GYROS, np.int64)
         self._next_identification = np.full(GYROS, MIN_IDENTIFICATION_INTERVALS)
         self._finished_intervals: list[MeasuredAndPredictedDrift] = []
-
-    @property
-    def interval_samples(self) -> int:
-        """Return the number of samples in an interval."""
-        return BLOCKS_PER_INTERVAL * self.block_samples
 
     @property
     def interval_s(self) -> float:

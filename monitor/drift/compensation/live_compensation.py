@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
+from drivers.data_types import AXES, Event, Floats, SampleBlock
 from monitor.common.unit_formatting import format_axis_value
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.gyro_drift_compensator import GYROS, Compensator, MeasuredAndPredictedDrift
@@ -63,7 +63,7 @@ class LiveDriftCompensation:
         for interval in self.compensator.take_finished_intervals():
             t_ns = newest_ns - round((self.compensator.sample_count - interval.end) / self._rate_hz * 1e9)
             self._publish(interval, t_ns)
-        return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
+        return samples.with_values(values)
 
     def take_drift_updates(self) -> list[MeasuredAndSubtractedDrift]:
         """Return the results of the intervals that have ended since the last call."""

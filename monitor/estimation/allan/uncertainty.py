@@ -268,20 +268,22 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     0.699 1.755
     """
     tail = (1.0 - probability) / 2.0
-    lo, hi = np.empty((2, avar.size))
-    levels = expand_chi2_quantile(tail), expand_chi2_quantile(1.0 - tail)
     # the kernel is compiled only for contiguous arrays that can be written
-    _fill_intervals(np.array(avar).ravel(), np.array(edf).ravel(), *levels, lo, hi)
-    return lo.reshape(avar.shape), hi.reshape(avar.shape)
+    inputs = np.array((avar, edf), np.float64)
+    ends = np.empty_like(inputs)
+    levels = expand_chi2_quantile(tail), expand_chi2_quantile(1.0 - tail)
+    _fill_intervals(inputs.reshape(2, -1), *levels, ends.reshape(2, -1))
+    return ends[0], ends[1]
 
 
 @compiled
-def _fill_intervals(avar: Floats, edf: Floats, low: Chi2Level, high: Chi2Level, lo: Floats, hi: Floats) -> None:
-    for i in range(avar.size):
-        lower, upper = chi2_quantile(edf[i], low), chi2_quantile(edf[i], high)
-        lo[i], hi[i] = np.sqrt(avar[i] * edf[i] / upper), np.sqrt(avar[i] * edf[i] / lower)
-        if lower == 0.0 and avar[i] >= 0.0:  # with less than one degree of freedom, the upper end may be infinite
-            hi[i] = np.inf
+def _fill_intervals(avar_and_edf: Floats, low: Chi2Level, high: Chi2Level, ends: Floats) -> None:
+    for i in range(ends.shape[1]):
+        avar, edf = avar_and_edf[0, i], avar_and_edf[1, i]
+        lower, upper = chi2_quantile(edf, low), chi2_quantile(edf, high)
+        ends[0, i], ends[1, i] = np.sqrt(avar * edf / upper), np.sqrt(avar * edf / lower)
+        if lower == 0.0 and avar >= 0.0:  # with less than one degree of freedom, the upper end may be infinite
+            ends[1, i] = np.inf
 
 
 @compiled

@@ -37,6 +37,7 @@ from monitor.estimation.allan.window_kernel import (
     WIDTH,
     WindowBuffers,
     append_staged_samples,
+    copy_variances,
     drift_slopes_by_axis_and_tau,
     keep_newest,
     view_window_arrays,
@@ -229,15 +230,17 @@ class AllanWindow:
 
     def avar(self) -> Floats:
         """Return the Allan variance [m, 6] in squared units of the axis; NaN if too many samples are missing."""
-        sums = (self._sums + self._rest)[:, :AXES]
-        m = self.factors[:, None] * self._scale[:AXES]
-        terms = self._terms[:, :AXES]
-        # Even on a constant axis, rounding causes second differences of up to one unit.
-        sums = np.where(sums <= terms, 0.0, sums)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
+        return self.variances_and_terms()[0]
 
-    def drift_slopes_by_axis_and_tau(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+    def variances_and_terms(self) -> tuple[Floats, Ints]:
+        """Return the Allan variance [m, 6], and the number of second differences [m, 6] that it averages."""
+        avar, terms = np.empty((self._taus, AXES)), np.empty((self._taus, AXES), np.int64)
+        copy_variances(self._memory, self._taus, avar, terms)
+        return avar, terms
+
+    def drift_slopes_by_axis_and_tau(
+        self, lengths: Ints | None = None, taus: int | None = None
+    ) -> tuple[Floats, Floats]:
         """Return the slope of the rate of each axis, and the slope at each averaging time.
 
         The slopes are defined in ``batch.rate_slope_from_thirds`` and ``batch.rate_slope_per_tau``.
@@ -246,6 +249,8 @@ class AllanWindow:
         ----------
         lengths : ndarray of int64, shape (6,), or None
             Number of newest samples that are used for each axis. None means all samples in the window.
+        taus : int or None
+            Number m of averaging times, from the first. None means all averaging times.
 
         Returns
         -------
@@ -254,10 +259,10 @@ class AllanWindow:
         slopes : ndarray of float64, shape (m, 6)
             Slope at each τ in units of the axis per sample.
         """
-        slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
+        slope, slopes = np.empty(AXES), np.empty((AXES, taus or self._taus))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
         drift_slopes_by_axis_and_tau(self._memory, self._taus, lengths, slope, slopes)
-        return slope / self._scale[:AXES], slopes / self._scale[:AXES]
+        return slope, slopes.T
 
     def term_counts(self) -> Ints:
         """Return the number of second differences [m, 6] that each Allan variance averages."""

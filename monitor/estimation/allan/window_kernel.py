@@ -404,8 +404,32 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
 
 
 @compiled
+def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints) -> None:
+    """Compute the Allan variance of each axis at each averaging time.
+
+    Parameters
+    ----------
+    memory, taus
+        Fields of ``WindowBuffers``.
+    avar : ndarray of float64, shape (m, 6)
+        Output array for the Allan variances in squared units of the axis; NaN if too many samples are missing.
+    terms : ndarray of int64, shape (m, 6)
+        Output array for the number of second differences that each Allan variance averages.
+    """
+    w = compiled_view_window_arrays(memory, taus)
+    for i in range(taus):
+        for axis in range(AXES):
+            at = i * LANES + axis
+            total, count, unit = w.sums[at] + w.rest[at], w.terms[at], w.factors[i] * w.scaling[axis]
+            # Even on a constant axis, rounding causes second differences of up to one unit.
+            total = 0.0 if total <= count else total
+            avar[i, axis] = total / (2.0 * unit * unit * count) if count > 0 else np.nan
+            terms[i, axis] = count
+
+
+@compiled
 def drift_slopes_by_axis_and_tau(memory: Ints, taus: int, lengths: Ints, slope: Floats, slopes: Floats) -> None:
-    """Compute the slope of the rate of each axis, and the slope at each averaging time.
+    """Compute the slope of the rate of each axis, and the slope at each of the first m averaging times.
 
     Parameters
     ----------
@@ -414,16 +438,17 @@ def drift_slopes_by_axis_and_tau(memory: Ints, taus: int, lengths: Ints, slope: 
     lengths : ndarray of int64, shape (6,)
         Number of newest samples that are used for each axis.
     slope : ndarray of float64, shape (6,)
-        Output array for the result of ``integer_slope_from_thirds`` for each axis.
-    slopes : ndarray of float64, shape (m, 6)
-        Output array for the result of ``mean_rate_slope`` for each τ and axis.
+        Output array for the result of ``integer_slope_from_thirds`` in units of the axis.
+    slopes : ndarray of float64, shape (6, m)
+        Output array for the result of ``mean_rate_slope`` in units of the axis.
     """
     w = compiled_view_window_arrays(memory, taus)
     for axis in range(AXES):
         n, newest = lengths[axis], w.state[NEWEST]
-        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis)
-        for i in range(w.factors.size):
-            slopes[i, axis] = mean_rate_slope(w.phase, w.missing, newest, n, w.factors[i], axis)
+        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis) / w.scaling[axis]
+        for i in range(slopes.shape[1]):
+            bend = mean_rate_slope(w.phase, w.missing, newest, n, w.factors[i], axis)
+            slopes[axis, i] = bend / w.scaling[axis]
 
 
 @compiled

@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block
+from drivers.data_types import AXES, Floats, Ints, SampleBlock
 from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
@@ -106,16 +106,23 @@ class MotionDetector:
         self._motions += [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
         out: list[SampleBlock] = []
         end = (int(blocks[-1]) + 1) * self._size if blocks.size else 0
+        moves = bool(moving.any())
         while self._held and self._held[0][0] < end:
             first, samples = self._held.popleft()
             if first + len(samples) > end:
                 self._held.appendleft((end, samples[end - first :]))
                 samples = samples[: end - first]
-            rows = (first + np.arange(len(samples))) // self._size
-            struck = moving[np.searchsorted(blocks, rows)].astype(bool)
-            self.samples_in_motion += int(struck.sum())
-            out.append(_remove_moving(samples, struck))
+            out.append(self._remove_moving(samples, first, blocks, moving) if moves else samples)
         return out
+
+    def _remove_moving(self, samples: SampleBlock, first: int, blocks: Ints, moving: Ints) -> SampleBlock:
+        rows = (first + np.arange(len(samples))) // self._size
+        struck = moving[np.searchsorted(blocks, rows)].astype(bool)
+        if not struck.any():
+            return samples
+        self.samples_in_motion += int(struck.sum())
+        values = np.where(struck[:, None], np.nan, samples.values)
+        return samples.with_values(values)
 
 
 def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[MotionEpisode]]:
@@ -164,13 +171,6 @@ def _decide_blocks(
     blocks, moving, episodes = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
     decided, ended = advance_motion_detection(values, first_index, size, stream_ends, state, blocks, moving, episodes)
     return blocks[:decided], moving[:decided], episodes[:ended]
-
-
-def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlock:
-    if not struck.any():
-        return samples
-    values = np.where(struck[:, None], np.nan, samples.values)
-    return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
 
 def _make_motion(episode: Floats, size: int, rate_hz: float) -> MotionEpisode:

@@ -33,17 +33,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints
+from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
 from monitor.estimation.fit.coefficients_with_intervals import Coefficients, Status
-from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
+from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.fit_kernel_types import (
+    NO_MAPS,
     FitOptions,
+    FitOutput,
     SharedInputs,
     VariancesAndSlopesOfAxes,
     empty_fit_output,
-    empty_solution_maps,
 )
-from monitor.estimation.fit.least_squares import N, R
+from monitor.estimation.fit.least_squares import R
 from monitor.noise.standard_terms import unit_coefficient_allan_variances
 
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -200,7 +202,6 @@ def fit_coefficients(
     found = empty_fit_output(
         axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
     )
-    maps = empty_solution_maps(axes, m)
     if start_theta is not None:
         found.theta[:] = start_theta.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
@@ -217,19 +218,27 @@ def fit_coefficients(
         VariancesAndSlopesOfAxes(curves, counts, slope, np.ascontiguousarray(slopes)),
         options,
         found,
-        maps,
+        NO_MAPS,
     )
-    to_si = design.rate_hz**TO_SI
-    value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
-    coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)
-    edf = found.edf.T
-    missing = np.isnan(edf) & (avar > 0.0)
-    if missing.any():
-        edf = np.where(missing, _white_edf(design, table, terms), edf)
+    value, lo, hi, theta = np.empty((4, 5, axes))
+    _convert_to_si(design.rate_hz, found, value, lo, hi, theta)
     return Fit(
-        coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
-        found.scatter, found.misfit, maps.either,
+        Coefficients(value, lo, hi, found.status.T), theta, found.fitted.T, found.edf.T, found.entered.T,
+        found.left_out, found.scatter, found.misfit, found.either,
     )  # fmt: skip
+
+
+@compiled
+def _convert_to_si(rate_hz: float, output: FitOutput, value: Floats, lo: Floats, hi: Floats, theta: Floats) -> None:
+    """Convert the results of all axes to SI units, in arrays of shape [5, axes]."""
+    for a in range(5):
+        to_si = rate_hz ** TO_SI[a]
+        for axis in range(value.shape[1]):
+            squared = output.theta[axis, a]
+            estimated = output.status[axis, a] == 2
+            value[a, axis] = np.sqrt(max(squared, 0.0)) * to_si if estimated else np.nan
+            lo[a, axis], hi[a, axis] = output.lo[axis, a] * to_si, output.hi[axis, a] * to_si
+            theta[a, axis] = squared * (to_si * to_si)
 
 
 def replace_axis_results(all_axes: Fit, axis: int, axis_fit: Fit) -> Fit:
@@ -289,11 +298,3 @@ def empty_fit(avar: Floats) -> Fit:
         misfit=np.ones(avar.shape[1]),
         k_or_r=np.zeros(avar.shape[1], np.bool_),
     )
-
-
-def _white_edf(design: DesignMatrix, table: CovarianceTable, terms: Ints) -> Floats:
-    """Return the degrees of freedom for white noise, which are used for axes that are not fitted."""
-    whole = table.terms[:, None]
-    ratio = np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)  # all / complete differences
-    own = table.covariance[:, :, WHITE].diagonal()[:, None] * ratio
-    return np.asarray(2.0 * design.columns[:, N, None] ** 2 / own)

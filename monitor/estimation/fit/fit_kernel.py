@@ -86,7 +86,7 @@ def fit_axes(
     output : FitOutput
         Results of the fit, updated in place.
     maps : SolutionMaps
-        Linear maps from the Allan variances to the solutions, updated in place.
+        Linear maps from the Allan variances to the solutions, updated in place; ``NO_MAPS`` if they are not needed.
     """
     for axis in range(first_axis, end_axis):
         _fit_axis(axis, shared, curves, options, output, maps)
@@ -109,33 +109,47 @@ def _fit_axis(
         shared.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     rows = _prepare_rows(axis, shared, curves, problem)
-    maps.used[axis, 0] = maps.used[axis, 1] = 0
-    maps.either[axis] = False
-    maps.straight[axis] = straight
+    stores_map = maps.used.shape[0] > 0
+    if stores_map:
+        maps.used[axis, 0] = maps.used[axis, 1] = 0
+        maps.straight[axis] = straight
+    _reset_results(axis, rows, shared, curves.terms[axis], output)
     if rows.size < MIN_ROWS:
         for a in range(5):
-            terms.entered[a], terms.status[a] = False, 0
+            terms.entered[a] = False
         return
     first, free = _fit_or_fall_back(axis, rows, problem, curve, shared.may_drop_short_taus, options, output)
     used, misfit = rows[first:], output.misfit[axis]
-    for a in range(5):
-        terms.lo[a], terms.hi[a], terms.status[a] = np.nan, np.nan, 0
     tests = select_terms(problem, used, options, straight, misfit, terms)
     tighten_bounds(problem, used, misfit, tests, terms)
     for a in range(5):
         if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # too few averaging times for an upper bound
             terms.status[a], terms.lo[a], terms.hi[a] = 0, np.nan, np.nan
-    noise, most, maps.either[axis] = update_ramp_selection(slope, shared.slope_variance, options, terms)
+    noise, most, output.either[axis] = update_ramp_selection(slope, shared.slope_variance, options, terms)
     compute_observation_variances(problem, rows, terms.theta)
     _draw(axis, rows, shared.columns, noise, problem.variance, output)
-    maps.free[axis] = free
-    if store_linear_map(axis, used, problem, curves, output, maps):
-        compute_linear_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
+    if stores_map:
+        maps.free[axis] = free
+        if store_linear_map(axis, used, problem, curves, output, maps):
+            compute_linear_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
         limit_terms_by_measured_avar(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
     if free:
         i = rows[0]
         bound_q_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
+
+
+@compiled
+def _reset_results(axis: int, rows: Ints, shared: SharedInputs, terms: Floats, output: FitOutput) -> None:
+    """Reset the results of an axis to those without a fit. The degrees of freedom are those of white noise."""
+    for a in range(5):
+        output.lo[axis, a], output.hi[axis, a], output.status[axis, a] = np.nan, np.nan, 0
+    for i in range(shared.whole.size):
+        output.edf[axis, i] = output.fitted[axis, i] = np.nan
+    for i in rows:
+        own = shared.covariance[i, i, WHITE] * (shared.whole[i] / terms[i])
+        output.edf[axis, i] = 2.0 * shared.columns[i, N] ** 2 / own
+    output.left_out[axis], output.misfit[axis], output.scatter[axis], output.either[axis] = 0, 1.0, np.inf, False
 
 
 @compiled
@@ -191,7 +205,9 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
         output.fitted[axis, i] = model if k >= output.left_out[axis] and model > 0.0 else np.nan
         # The cross term of drift and noise in the squared second differences adds the variance 4 R² (m²/2)² Var(slope).
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
-        output.edf[axis, i] = 2.0 * positive * positive / variance[i]
+        edf = 2.0 * positive * positive / variance[i]
+        if edf == edf:
+            output.edf[axis, i] = edf
 
 
 @compiled

@@ -59,6 +59,7 @@ class FitOutput(NamedTuple):
     left_out: Ints  # [axes] number of averaging times that are left out, from the shortest τ
     misfit: Floats  # [axes] equal to ``scatter`` if the residuals are significantly too large, otherwise 1
     scatter: Floats  # [axes] mean squared residual, relative to the variance that the five noise terms explain
+    either: NDArray[np.bool_]  # [axes] True if K and R cannot be distinguished
 
 
 class TermResults(NamedTuple):
@@ -112,11 +113,12 @@ class SolutionMaps(NamedTuple):
     used: Ints  # [axes, 2] range of the τ that are used; empty if there is no solution
     free: NDArray[np.bool_]  # [axes] True if Q² may be negative
     straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the Allan variance
-    either: NDArray[np.bool_]  # [axes] True if K and R cannot be distinguished
 
 
 def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput:
-    """Allocate the arrays for the results of a fit.
+    """Allocate the arrays for the results of a fit, in which only the inputs ``entered`` and ``theta`` have values.
+
+    ``theta`` is NaN, which means that no recent fit is known.
 
     Parameters
     ----------
@@ -127,10 +129,12 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
     entered : ndarray of bool, shape (axes, 5)
         Noise terms of the previous fit, which become part of the returned object.
     """
-    theta, lo, hi = np.full((3, axes, 5), np.nan)
-    edf, fitted = np.full((2, axes, m), np.nan)
-    status, left_out = np.zeros((axes, 5), np.int8), np.zeros(axes, np.int64)
-    return FitOutput(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
+    theta, lo, hi = np.empty((3, axes, 5))
+    theta[:] = np.nan
+    edf, fitted = np.empty((2, axes, m))
+    misfit, scatter = np.empty((2, axes))
+    status, left_out, either = np.empty((axes, 5), np.int8), np.empty(axes, np.int64), np.empty(axes, np.bool_)
+    return FitOutput(entered, theta, lo, hi, status, edf, fitted, left_out, misfit, scatter, either)
 
 
 def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
@@ -139,15 +143,19 @@ def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
     Parameters
     ----------
     axes : int
-        Number of axes.
+        Number of axes; 0 if the linear maps are not needed.
     m : int
         Number of τ.
     """
     ramp, twist = np.zeros((2, axes, NOISES))
     inverse, whole = np.zeros((2, axes, NOISES, NOISES))
     limits = np.full((axes, LIMIT_COUNT + 1), np.inf)
-    free, straight, either = np.zeros((3, axes), np.bool_)
+    free, straight = np.zeros((2, axes), np.bool_)
     return SolutionMaps(
         np.zeros((axes, m, NOISES)), ramp, twist, np.zeros((axes, 5, 5)), inverse, whole, limits, -limits,
-        np.zeros((axes, 2), np.int64), free, straight, either,
+        np.zeros((axes, 2), np.int64), free, straight,
     )  # fmt: skip
+
+
+NO_MAPS: Final = empty_solution_maps(0, 0)
+"""Argument ``maps`` of a fit whose linear maps are not needed."""

@@ -104,6 +104,7 @@ class ContinuousRefit:
     def restart_all_fits(self) -> None:
         """Restart the fits of all axes from an empty set of noise terms."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
+        output.status[:], output.misfit[:] = Status.UNESTIMATED, 1.0
         self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
         self._used: list[CovarianceTable | None] = [None] * AXES  # covariance tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []

@@ -94,7 +94,7 @@ def encode_json(value: Any) -> bytes:
     return _ENCODER.encode(value)
 
 
-def attributes_with_field_names(struct_type: type[msgspec.Struct], source: object) -> dict[str, Any]:
+def attributes_with_field_names(struct_type: type[msgspec.Struct], source: Any) -> dict[str, Any]:
     """Return the attributes of an object that have the same names as the fields of a struct.
 
     Parameters
@@ -104,7 +104,14 @@ def attributes_with_field_names(struct_type: type[msgspec.Struct], source: objec
     source
         Object with the attributes.
     """
-    return {name: getattr(source, name) for name in struct_type.__struct_fields__ if hasattr(source, name)}
+    return {name: getattr(source, name) for name in _shared_names(struct_type.__struct_fields__, source.__class__)}
+
+
+@cache
+def _shared_names(names: tuple[str, ...], source_type: type) -> tuple[str, ...]:
+    """Return the names that are also attributes of a class, or fields of a dataclass."""
+    own = {*dir(source_type), *getattr(source_type, "__dataclass_fields__", ())}
+    return tuple(name for name in names if name in own)
 
 
 def remove_control_characters(text: str) -> str:

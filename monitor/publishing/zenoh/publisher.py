@@ -129,14 +129,12 @@ class ZenohPublisher(RetriedSession):
         payload
             Encoded message.
         """
-        import zenoh
-
         publisher = self._publishers.get(topic.key(self.settings.prefix, device))
         if publisher is None:
             return
         try:
             publisher.put(payload)
-        except zenoh.ZError as error:
+        except zenoh_errors() as error:
             self._unsent = f"cannot send: {format_zenoh_error(error)}"
         else:
             self._unsent = ""

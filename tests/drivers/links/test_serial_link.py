@@ -76,8 +76,8 @@ def test_continuous_data_are_read_without_waiting(
     assert isinstance(link, serial_link.SerialLink)
     link.open()
     waits: list[float] = []
-    wait = link._closing.wait
-    monkeypatch.setattr(link._closing, "wait", lambda timeout_s: waits.append(timeout_s) or wait(timeout_s))
+    wait = link._interrupt.wait_and_clear
+    monkeypatch.setattr(link._interrupt, "wait_and_clear", lambda timeout_s: waits.append(timeout_s) or wait(timeout_s))
     monkeypatch.setattr(serial_link, "MAX_WAITING_BYTES", serial_link.READ_BYTES // 2)
     sent = os.urandom(20 * serial_link.READ_BYTES)
     parts = [sent[at : at + 500] for at in range(0, len(sent), 500)]

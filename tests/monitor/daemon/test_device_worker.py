@@ -13,6 +13,7 @@ from drivers.decoders.binary_frames import vectornav_binary
 from drivers.decoders.messages import samples
 from drivers.decoders.text_lines import text
 from drivers.errors import ConfigError
+from drivers.host.wake_signal import WakeSignal
 from drivers.links import replay_link
 from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
@@ -98,7 +99,7 @@ class WorkerHarness:
             thermal_s=thermal_s,
             compensate=compensate,
         )
-        self.wake = threading.Event()
+        self.wake = WakeSignal()
         self.ready = ready or KernelReadiness()
         if ready is None:
             self.ready.window.set()
@@ -345,7 +346,7 @@ def test_replay_through_the_reader_thread_is_processed_to_the_end():
     assert harness.output.estimates[-1][1].samples == 400
     assert harness.worker.slew_and_publish_status({"zenoh": "ok"}, 7).received == 400
     assert (harness.output.healths[-1].state, harness.output.healths[-1].memory_bytes) == ("ended", 7)
-    assert harness.wake.is_set()
+    assert harness.wake.wait_and_clear(0.0)
     # The times are Unix times of samples stamped by the monotonic clock.
     assert begun_s - 5.0 <= harness.output.estimates[-1][0] <= time.time() + 5.0
 
@@ -456,7 +457,7 @@ def test_captures_and_fast_simulations_skip_the_rate_check(tmp_path):
         '[device.driver.decoder_options]\ncolumns = ["gx", "gy", "gz"]\n'
     )
     (device,) = settings.load_config(config).devices
-    worker = DeviceWorker(device, LoopbackLink(), [], threading.Event(), KernelReadiness())
+    worker = DeviceWorker(device, LoopbackLink(), [], WakeSignal(), KernelReadiness())
     for i in range(9000):
         worker.clock.assign_times(make_block(np.array([10**12 + i * 333_333]), np.zeros((1, 6))))
     assert not worker.clock.rate_check_pending

@@ -16,6 +16,7 @@ import pytest
 from drivers.data_types import Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders.text_lines import text
 from drivers.driver import AxisMap
+from drivers.host.wake_signal import WakeSignal
 from drivers.recordings import load_samples, segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.daemon.device.device_worker import DeviceWorker
@@ -336,7 +337,7 @@ def make_worker(
     device = Device.model_construct(
         name="bench", rate_hz=RATE, window_s=window_s, axes=axes or AxisMap(), driver=driver
     )
-    return DeviceWorker(device, link, [], threading.Event(), ready, sample_recorder)
+    return DeviceWorker(device, link, [], WakeSignal(), ready, sample_recorder)
 
 
 def make_recent_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
