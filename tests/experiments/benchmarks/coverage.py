@@ -99,8 +99,8 @@ def tables(chunks: list[Chunk]) -> str:
     """Return the tables in Markdown."""
     groups = group_chunks(chunks)
     parts = [
-        "The first table gives the percentage of correct results. The figure for deviations is the average over all τ up "
-        "to an eighth of the record. The figure for the worst τ is in parentheses.",
+        "The first table gives the percentage of correct results. The figure for deviations is the average over all τ "
+        "up to an eighth of the record. The figure for the worst τ is in parentheses.",
         format_table(("record", "noise", "deviations", *SYMBOLS), [_correct(*g) for g in groups.items()]),
         "The next table gives the percentage of records in which a term is estimated. Parentheses mark terms that the "
         "noise does not contain.",
