@@ -19,7 +19,7 @@ class ConstantBias(Source):
 
     value: float = parameter_field("rad/s", "m/s²", signed=True)
 
-    description: ClassVar[str] = "The sensor reads a constant value when the true value is zero."
+    description: ClassVar[str] = "The sensor reads a constant offset when the true value is zero."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum with a constant bias and no noise."""

@@ -19,7 +19,7 @@ class CrossAxis(AxisLeak):
     source: str = source_axis_field()
     coefficient: float = parameter_field("1", signed=True)
 
-    description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
+    description: ClassVar[str] = "A misalignment adds a fraction of the signal of another axis."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the source is the axis itself or has a different unit."""

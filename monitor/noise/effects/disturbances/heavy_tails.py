@@ -28,7 +28,7 @@ class HeavyTails(Effect):
     nu: float = parameter_field("1", number_range=DEGREES_OF_FREEDOM)
     share: float | None = parameter_field("1", maximum=1.0, optional=True)
 
-    description: ClassVar[str] = "Large errors of the white noise are more frequent than in Gaussian noise."
+    description: ClassVar[str] = "Large values of the white noise are more frequent than in Gaussian noise."
 
     def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
         """Start a random gain, which turns Gaussian samples into samples of Student's t distribution."""

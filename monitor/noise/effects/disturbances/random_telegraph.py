@@ -28,9 +28,7 @@ class RandomTelegraph(Source):
     amplitude: float = parameter_field("rad/s", "m/s²")
     dwell_time: float = parameter_field("s", positive=True)
 
-    description: ClassVar[str] = (
-        "The bias jumps between two levels at random times, which is also called popcorn noise."
-    )
+    description: ClassVar[str] = "The bias jumps between two levels at random times (popcorn noise)."
 
     @property
     def events_hz(self) -> float:

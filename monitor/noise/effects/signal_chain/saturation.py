@@ -31,7 +31,7 @@ class Saturation(Transform):
 
     limit: float = parameter_field("rad/s", "m/s²", positive=True)
 
-    description: ClassVar[str] = "Values beyond the measurement range are replaced by the end of the range."
+    description: ClassVar[str] = "Values beyond the measurement range are replaced by the nearest limit of the range."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged if the signal stays within the range for one hour, otherwise NaN."""

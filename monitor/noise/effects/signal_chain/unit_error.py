@@ -23,7 +23,9 @@ class UnitError(Transform):
 
     factor: float = parameter_field("1", positive=True)
 
-    description: ClassVar[str] = "All output values are multiplied by the factor of a wrong unit."
+    description: ClassVar[str] = (
+        "All output values are multiplied by a constant factor, as if they were in a wrong unit."
+    )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum multiplied by f²."""
