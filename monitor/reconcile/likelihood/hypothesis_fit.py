@@ -15,6 +15,7 @@ from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
+    BiasStep,
     CommonVibration,
     ExponentiallyCorrelated,
     PulseTrain,
@@ -34,6 +35,11 @@ RESIZE_PENALTY_NATS: Final = 7.0
 If the size in the model is true, the gain exceeds 7 nats by chance with the probability P(χ²₁ > 14) = 0.02 %. A
 recording with six axes has about 24 sizes, so this occurs in about one of 200 recordings.
 """
+STEP_TIME_95_NATS: Final = -log(1.0 - sqrt(0.95))
+"""Loss of log-likelihood at the true time of a step that is exceeded with a probability of 5 %, in nats."""
+MIN_INTERVAL_LOG: Final = 1e-6
+MAX_INTERVAL_LOG: Final = 2.0
+"""Smallest and largest half width of an interval in the search, on a logarithmic scale."""
 GOLDEN: Final = 0.6180339887498949
 SHAPE_ITERATIONS: Final = 12
 MAX_LOG_HALF_WIDTH: Final = 3.0
@@ -338,6 +344,9 @@ def with_shape(effect: Effect, name: str, value: float) -> Effect:
 def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str) -> ParameterInterval:
     """Compute the 95 % interval of a shape parameter from the profile likelihood.
 
+    The likelihood of the time t of a step is not smooth. Its logarithm falls on both sides of the maximum like a random
+    walk with a drift, so P(loss at the true time < x) = (1 − exp(−x))² (Hinkley, Biometrika 57 (1970) 1).
+
     Parameters
     ----------
     fit : AxisFit
@@ -349,20 +358,21 @@ def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str)
     """
     effects, effect = fit.effects, fit.effects[effect_index]
     value = float(getattr(effect, parameter_name))
+    limit_nats = STEP_TIME_95_NATS if isinstance(effect, BiasStep) else HALF_CHI2_95
 
-    def log_likelihood_loss(factor: float) -> float:
-        shaped = with_shape(effect, parameter_name, value * factor)
+    def is_likely(log_factor: float) -> bool:
+        shaped = with_shape(effect, parameter_name, value * exp(log_factor))
         changed = (*effects[:effect_index], shaped, *effects[effect_index + 1 :])
-        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood
+        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood < limit_nats
 
     ends = []
     for sign in (-1.0, 1.0):
-        step = 1e-6
-        while step < 2.0 and log_likelihood_loss(exp(sign * step)) < HALF_CHI2_95:
+        step = MIN_INTERVAL_LOG
+        while step < MAX_INTERVAL_LOG and is_likely(sign * step):
             step *= 2.0
         lo, hi = 0.5 * step, step
         for _ in range(8):
             middle = 0.5 * (lo + hi)
-            lo, hi = (middle, hi) if log_likelihood_loss(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
+            lo, hi = (middle, hi) if is_likely(sign * middle) else (lo, middle)
         ends.append(float(getattr(with_shape(effect, parameter_name, value * exp(sign * hi)), parameter_name)))
     return ParameterInterval(value, ends[0], ends[1])

@@ -16,6 +16,7 @@ from monitor.noise.effects import (
     RateRandomWalk,
     Sinusoidal,
 )
+from monitor.reconcile.diagnostics.whiteness_tests import compute_level_step_gains
 from monitor.reconcile.likelihood.hypothesis_fit import (
     compute_shape_interval,
     compute_size_interval,
@@ -24,6 +25,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_with_fixed_noise,
     with_shape,
 )
+from monitor.reconcile.likelihood.whitening import whiten_axis
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     WALK,
@@ -140,6 +142,21 @@ def test_intervals_of_a_line_contain_its_frequency():
         error = np.sqrt(6.0 / n) / (np.pi * n / RATE_HZ) * N * RATE_HZ**0.5 / 3e-4
         assert found.hi - found.lo == pytest.approx(2 * 1.96 * error, rel=0.15)
     assert np.mean(inside) >= 0.75
+
+
+@pytest.mark.long
+def test_intervals_of_a_step_contain_its_time():
+    """With the threshold of a smooth likelihood, about 82 % of the intervals contain the time."""
+    inside = []
+    for seed in range(60):
+        rng = np.random.default_rng([1, seed])
+        time = rng.uniform(0.2, 0.8) * n / RATE_HZ
+        one = axis(white(n, rng) + 4e-4 * (time_s(n) >= time))
+        gains, times_s, _ = compute_level_step_gains(whiten_axis(fit_with_fixed_noise(one, (WHITE,)).fit))
+        step = BiasStep(time=float(times_s[int(np.argmax(gains))]), height=1.0)
+        found = compute_shape_interval(fit_with_fewest_changes(one, (step,), (WHITE,)).fit, 1, "time")
+        inside.append(found.lo <= time <= found.hi)
+    assert np.mean(inside) >= 0.9
 
 
 def test_intervals_of_sizes_contain_the_true_sizes():
