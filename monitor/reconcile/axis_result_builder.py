@@ -43,11 +43,9 @@ MAX_FREQUENCY_DIFFERENCE: Final = 0.05
 MIN_COVERED_SHARE: Final = 0.25
 """Smallest share of the frequencies of a remaining difference that an oscillation of the wrong shape covers."""
 MAX_CONFIDENCE_OF_WRONG_SHAPE: Final = 0.5
-"""Largest confidence of an oscillation if a significant difference remains at its frequency. The spectrum then has
-another shape. This value is empirical: the trials contain such oscillations only for unknown effects."""
-WRONG_SHAPE_TEXT: Final = (
-    "A difference remains at its frequency, so the effect describes the spectrum only approximately."
-)
+"""Largest confidence of an effect whose spectrum has probably another shape. This value is empirical: in the trials, such
+effects only have causes without a name."""
+SPECTRUM_DIAGNOSTICS: Final = ("psd", "lines")
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
@@ -81,10 +79,12 @@ def build_axis_result(
     for at, index, kind in changes:
         before = snapshots[0 if search.rounds[at].replaces_effects else at]
         step = _describe_step(search, search.rounds[at], index, kind, before, snapshots[at + 1])
-        if kind == "added" and _has_remaining_difference(search.hypothesis.effects[index], left_over):
+        step = replace(step, gain_nats=gains.get(index, 0.0), allan=influences[index])
+        doubt = _doubt_about_shape(search.hypothesis.effects[index], step.gain_nats, left_over)
+        if kind == "added" and doubt:
             confidence = min(step.confidence, MAX_CONFIDENCE_OF_WRONG_SHAPE)
-            step = replace(step, confidence=confidence, because=f"{step.because} {WRONG_SHAPE_TEXT}")
-        steps.append(replace(step, gain_nats=gains.get(index, 0.0), allan=influences[index]))
+            step = replace(step, confidence=confidence, because=f"{step.because} {doubt}")
+        steps.append(step)
     decision = _axis_decision(bool(steps), bool(left_over))
     remaining = measure_remaining_gaps(search, left_over)
     return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
@@ -183,10 +183,17 @@ def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics
     return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
 
 
-def _has_remaining_difference(effect: Effect, left_over: tuple[DiagnosticGap, ...]) -> bool:
-    """Return True if a difference in the spectrum remains mainly at the frequency of an oscillation."""
-    places = (gap.where.frequency for gap in left_over if gap.diagnostic in ("psd", "lines"))
-    return any(place and share_of_frequencies_covered(effect, place) > MIN_COVERED_SHARE for place in places)
+def _doubt_about_shape(effect: Effect, gain_nats: float, left_over: tuple[DiagnosticGap, ...]) -> str:
+    """Return why the spectrum of an added effect has probably another shape, or an empty text."""
+    if MOST_DIRECT_DIAGNOSTIC.get(effect.name) not in SPECTRUM_DIAGNOSTICS:
+        return ""
+    spectrum = [gap for gap in left_over if gap.diagnostic in SPECTRUM_DIAGNOSTICS]
+    places = (gap.where.frequency for gap in spectrum)
+    if any(place and share_of_frequencies_covered(effect, place) > MIN_COVERED_SHARE for place in places):
+        return "A difference remains at its frequency, so the effect describes the spectrum only approximately."
+    if max((0.5 * gap.gap**2 for gap in spectrum), default=0.0) > gain_nats:
+        return "A larger difference of the spectrum remains, so the name is uncertain."
+    return ""
 
 
 def _trials_not_added_too(hypothesis: Hypothesis, index: int, trials: tuple[Trial, ...]) -> tuple[Trial, ...]:

@@ -50,6 +50,13 @@ def steep_resonance(size, rng, sigma, frequency_hz, half_width_hz):
     return sigma * series / series.std()
 
 
+def band_limited(size, rng, sigma, lo_hz, hi_hz):
+    """White noise in a frequency band, and nothing elsewhere."""
+    spectrum, f = np.fft.rfft(rng.standard_normal(size)), np.fft.rfftfreq(size, 1.0 / RATE_HZ)
+    series = np.fft.irfft(np.where((f > lo_hz) & (f < hi_hz), spectrum, 0.0), size)
+    return sigma * series / series.std()
+
+
 def make_hidden_effect(name):
     rng = np.random.default_rng(1)
     return {
@@ -60,6 +67,7 @@ def make_hidden_effect(name):
         "line and outliers": draw_noise() + LINE + (rng.random(n) < 1e-3) * 1.5e-2 * rng.standard_normal(n),
         "clustered outliers": draw_noise() + np.repeat(rng.random(n // 4) < 1e-3, 4) * 1.5e-2 * rng.standard_normal(n),
         "correlated": draw_noise() + correlated(n, rng, 3e-4, 0.5),
+        "band with sharp edges": draw_noise() + band_limited(n, np.random.default_rng(1), 4.7e-4, 5.0, 10.0),
         "steep resonance": draw_noise() + steep_resonance(n, np.random.default_rng(1), 1e-3, 17.0, 2.0),
         "filtered and coarse": 4e-4 * np.rint(draw_noise() / 4e-4),
     }[name]
@@ -196,6 +204,14 @@ def test_resonance_beside_a_remaining_difference_is_not_certain():
     assert "only approximately" in resonance.because
     (line,) = describe_effect("line").steps
     assert "only approximately" not in line.because
+
+
+def test_names_beside_a_larger_remaining_difference_are_not_certain():
+    result = describe_effect("band with sharp edges")
+    assert result.verdict == "partly_explained"
+    added = [step for step in result.steps if step.kind == "added"]
+    assert added
+    assert all(step.confidence <= 0.5 and "the name is uncertain" in step.because for step in added)
 
 
 def test_one_size_and_a_common_factor_of_white_noise_are_equally_likely():
