@@ -43,8 +43,8 @@ MAX_FREQUENCY_DIFFERENCE: Final = 0.05
 MIN_COVERED_SHARE: Final = 0.25
 """Smallest share of the frequencies of a remaining difference that an oscillation of the wrong shape covers."""
 MAX_CONFIDENCE_OF_WRONG_SHAPE: Final = 0.5
-"""Largest confidence of an effect whose spectrum has probably another shape. This value is empirical: all such effects in
-the trials were wrong names."""
+"""Largest confidence of an effect whose spectrum has probably another shape. This value is empirical: in the
+trials, all such effects were wrong."""
 SPECTRUM_DIAGNOSTICS: Final = ("psd", "lines")
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
