@@ -177,6 +177,9 @@ class BlockBuilder:
         temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
         good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
+        if n and good.all() and (bad_before is None or not bad_before.any()):
+            self.bad += bad_after
+            return [make_block(t_ns, values, temperature_c, ticks, carried)]
         bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
         ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
         temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c

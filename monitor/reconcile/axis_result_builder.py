@@ -34,6 +34,7 @@ from monitor.reconcile.search.withdrawal_of_contradicted_effects import OSCILLAT
 from monitor.reconcile.summary.effect_contributions import (
     compute_allan_influences_of_changes,
     decompose_explained_gain,
+    find_original_effects,
     measure_remaining_gaps,
 )
 
@@ -46,6 +47,13 @@ MAX_CONFIDENCE_OF_WRONG_SHAPE: Final = 0.5
 """Largest confidence of an effect whose spectrum has probably another shape. This value is empirical: in the
 trials, all such effects were wrong."""
 SPECTRUM_DIAGNOSTICS: Final = ("psd", "lines")
+MOVED_PARAMETERS: Final = {
+    "sinusoidal": "frequency",
+    "narrowband": "frequency or bandwidth",
+    "bandwidth_limit": "cutoff, order or kind",
+    "resolution": "step",
+}
+"""Parameters that differ between the model and the recording if an effect has moved."""
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence with which an alternative effect is reported."""
 
@@ -109,17 +117,18 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
     hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
     left = list(range(hypothesis.model_effect_count, len(hypothesis.effects)))
-    resized = set(changed_sizes(hypothesis))
+    last_move = {one.trials[0].moved: at for at, one in enumerate(search.rounds)}
+    resized = set(changed_sizes(hypothesis)) - last_move.keys()
     for at, one in enumerate(search.rounds):
         last = one.hypothesis.effects[-1]
         index = next((i for i in left if type(hypothesis.effects[i]) is type(last)), None)
         moved = one.trials[0].moved
         if moved is not None:
-            found.append((at, moved, "retuned"))
+            if last_move[moved] == at:
+                found.append((at, moved, "retuned"))
         elif index is not None and one.hypothesis.added and one.trials[0].effect is not None:
             left.remove(index)
             found.append((at, index, "added"))
-        resized.discard(moved if moved is not None else -1)
         last_round = at == len(search.rounds) - 1
         for noise in sorted(resized):
             if noise in one.hypothesis.fit.fitted_noise or last_round:
@@ -166,6 +175,7 @@ def _describe_step(
         held_out_reason=done.validation.reason,
         because=_justification(effect, kind, gap, later, others, trial),
         snapshot_after=after,
+        moved_from=find_original_effects(search).get(index) if moved else None,
     )
 
 
@@ -315,7 +325,7 @@ def _justification(
         sentences = [f"{effect.name} explains a difference that no diagnostic alone detects: {gaps}."]
     if kind != "added":
         is_moved = trial.moved is not None and trial.name == effect.name
-        parameter = (EFFECT_PROPERTIES[effect.name].identity or "step") if is_moved else "size"
+        parameter = MOVED_PARAMETERS[effect.name] if is_moved else "size"
         change = f"another {parameter} of" if kind == "retuned" else "no"
         sentences.append(f"With {change} {effect.name}, which the model has, the gap is {after.gap:.1f}.")
         return " ".join(sentences)

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from drivers.data_types import Floats
+from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
 
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
@@ -138,6 +139,7 @@ class AddedOrResizedEffect:
     snapshot_after: AxisModelDiagnostics
     gain_nats: float = 0.0  # part of the gap that the effect closes
     allan: AllanInfluence | None = None
+    moved_from: Effect | None = None  # effect of the model under test whose frequency, shape or step has changed
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,6 +128,7 @@ class Trial:
     misfit_nats: float = 0.0  # difference from the data that ``effect`` hides from the diagnostics
     gain_over_same_spectrum: float = 0.0  # gain over the Gaussian effect with the same spectrum, nats
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
+    replaced: Effect | None = None  # this model effect
 
     @property
     def score_with_slow_noise(self) -> float:
@@ -215,7 +216,7 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
         grid = statistics.quantization
         resolution = Resolution(step=grid.step.value)
         trial = _penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels)
-        found.append(replace(trial, moved=changed))
+        found.append(replace(trial, moved=changed, replaced=None if changed is None else whitened.effects[changed]))
     if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.effect_types:
         ends = statistics.clipping
         saturation = Saturation(limit=ends.limit.value)
@@ -437,7 +438,7 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
             assert isinstance(effect, Sinusoidal | Narrowband)
             distance = abs(float(np.log(effect.frequency / known.frequency)))
             score = gain - PENALTY_NATS[new.name] + MOVE_ADVANTAGE_NATS - distance
-            found.append(Trial(new.name, effect, score, moved=at))
+            found.append(Trial(new.name, effect, score, moved=at, replaced=known))
     return found
 
 
@@ -459,7 +460,7 @@ def _changed_low_pass_trials(hypothesis: Hypothesis) -> list[Trial]:
     model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
     changed = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
     gain = changed.penalised_log_likelihood - hypothesis.penalised_log_likelihood
-    return [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at)]
+    return [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at, replaced=known)]
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:

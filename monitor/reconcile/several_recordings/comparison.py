@@ -140,7 +140,10 @@ def _add_common_effects(
             if matched.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = find_closest_effect(known, matched.effect, effect_parameters(made))
+                is_known = step.moved_from is not None and step.moved_from in known
+                old = (
+                    step.moved_from if is_known else find_closest_effect(known, matched.effect, effect_parameters(made))
+                )
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 

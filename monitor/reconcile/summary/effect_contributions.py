@@ -7,10 +7,10 @@ explained gap.
 
 Outliers, heavy tails, changes of the variance, random jumps and wandering lines are not fully visible in the likelihood
 of the spectrum. The gain of the test that found them is added. For random jumps, only the gain over Gaussian noise with
-the same spectrum is added. The gain of a moved line is the score of its trial. The likelihood of quantized, clipped or
-repeated values is unbounded, because a continuous distribution never yields equal values. The gain of these effects is
-the gain of their influence on the noise (``value_artifact_gain``). If the model was fitted to the same recording, only
-added effects have a gain, because the sizes of the model cannot serve as a reference.
+the same spectrum is added. The likelihood of quantized, clipped or repeated values is unbounded, because a continuous
+distribution never yields equal values. The gain of these effects is the gain of their influence on the noise
+(``value_artifact_gain``). If the model was fitted to the same recording, only added effects have a gain, because the
+sizes of the model cannot serve as a reference.
 
 The **remaining gap** is the sum over the groups of diagnostics in ``GROUPS``. The diagnostics of a group detect the
 same difference, so the gain of a group is that of its strongest significant diagnostic. For the spectrum, the gain from
@@ -91,12 +91,14 @@ def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> di
     """
     hypothesis = search.hypothesis
     left = set(range(hypothesis.model_effect_count, len(hypothesis.effects)))
+    originals = find_original_effects(search)
     if not fitted_first:
         left.update(changed_sizes(hypothesis))
+        left.update(at for at, effect in originals.items() if not isinstance(effect, Resolution))
     gains: dict[int, float] = {}
     now = hypothesis.fit.log_likelihood
     while left:
-        without = {at: fit_without(hypothesis, {at, *gains}).log_likelihood for at in left}
+        without = {at: fit_without(hypothesis, {at, *gains}, originals).log_likelihood for at in left}
         least = max(without, key=lambda at: without[at])
         gains[least] = max(now - without[least], 0.0)
         now = min(now, without[least])
@@ -106,7 +108,18 @@ def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> di
     return gains
 
 
-def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
+def find_original_effects(search: AxisSearchResult) -> dict[int, Effect]:
+    """Return the effects of the model under test that the search has moved or changed in shape, by their index."""
+    found: dict[int, Effect] = {}
+    for trial in (one.trials[0] for one in search.rounds):
+        if trial.moved is not None and trial.replaced is not None:
+            found.setdefault(trial.moved, trial.replaced)
+    return found
+
+
+def fit_without(
+    hypothesis: Hypothesis, removed: Collection[int], originals: Mapping[int, Effect] | None = None
+) -> AxisFit:
     """Fit a hypothesis without some of its changes.
 
     An effect of the model is reset to its old size, and an added effect is left out. The other changed sizes are
@@ -118,6 +131,8 @@ def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
         Hypothesis with all changes.
     removed : collection of int
         Indices of the effects whose changes are removed.
+    originals : mapping of int to Effect, optional
+        Original effects of the model that have moved, by their index.
     """
     effects: list[Effect] = []
     fixed: set[int] = set()
@@ -127,7 +142,7 @@ def fit_without(hypothesis: Hypothesis, removed: Collection[int]) -> AxisFit:
             continue
         if at in removed or at in unchanged:
             fixed.add(len(effects))
-        effects.append(hypothesis.model[at] if at in removed else effect)
+        effects.append((originals or {}).get(at, hypothesis.model[at]) if at in removed else effect)
     return hypothesis.axis.fit(effects, frozenset(fixed))
 
 
@@ -146,10 +161,9 @@ def _gains_outside_spectrum(search: AxisSearchResult) -> dict[int, float]:
         elif isinstance(effect, CommonVibration):
             trials = [one.trials[0] for one in search.rounds]
             found[at] = next((one.score for one in trials if one.effect == effect), 0.0)
-    for trial in (one.trials[0] for one in search.rounds):
-        if trial.moved is not None:
-            is_quantized = isinstance(trial.effect, Resolution)
-            found[trial.moved] = value_artifact_gain(hypothesis.fit, Resolution) if is_quantized else trial.score
+    for at, effect in find_original_effects(search).items():
+        if isinstance(effect, Resolution):
+            found[at] = value_artifact_gain(hypothesis.fit, Resolution)
     return found
 
 

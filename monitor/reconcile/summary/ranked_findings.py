@@ -140,16 +140,20 @@ def _belongs_to(group: Sequence[_AxisStep], one: _AxisStep, r: Reconciliation) -
     if step.effect != first.effect and not {step.effect, first.effect} <= set(PEAK_NAMES):
         return False
     ratio, first_ratio = _size_ratio(axis, step, r), _size_ratio(first_axis, first, r)
-    if ratio and first_ratio and not _factors_agree(axis, ratio, first_axis, first_ratio):
+    both_moved = step.moved_from is not None and first.moved_from is not None
+    if ratio and first_ratio and not _factors_agree(axis, ratio, first_axis, first_ratio, both_moved):
         return False
     a, b = (find_identifying_parameter(two, name, r.model) for name, two in (group[0], one))
     return distance_if_parameters_match(step.effect, a, b) is not None
 
 
-def _factors_agree(axis: str, ratio: float, other_axis: str, other_ratio: float) -> bool:
-    """Return True if two sizes changed by nearly the same factor. Axes of both triads agree if no size changed."""
-    same_triad, unchanged = axis[0] == other_axis[0], abs(log(ratio)) <= MAX_LOG_RATIO_DIFFERENCE
-    return (same_triad or unchanged) and abs(log(ratio / other_ratio)) <= MAX_LOG_RATIO_DIFFERENCE
+def _factors_agree(axis: str, ratio: float, other_axis: str, other_ratio: float, both_moved: bool) -> bool:
+    """Return True if two sizes changed by nearly the same factor.
+
+    Only axes of one triad have a common factor. A moved effect whose size is unchanged is common to both triads.
+    """
+    unchanged = both_moved and abs(log(ratio)) <= MAX_LOG_RATIO_DIFFERENCE
+    return (axis[0] == other_axis[0] or unchanged) and abs(log(ratio / other_ratio)) <= MAX_LOG_RATIO_DIFFERENCE
 
 
 def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:
@@ -169,8 +173,8 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
 
 def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> float | None:
     """Return the frequency in the model, in Hz, of a line, resonance or cutoff that has moved, or None."""
-    before, place = _effect_before(axis, step, r, "frequency"), find_identifying_parameter(step, axis, r.model)
-    if step.kind != "retuned" or not isinstance(before, Sinusoidal | Narrowband | BandwidthLimit) or place is None:
+    before, place = step.moved_from, find_identifying_parameter(step, axis, r.model)
+    if not isinstance(before, Sinusoidal | Narrowband | BandwidthLimit) or place is None:
         return None
     old = before.cutoff if isinstance(before, BandwidthLimit) else before.frequency
     unchanged = old == place.value or (place.lo is not None and place.hi is not None and place.lo <= old <= place.hi)
@@ -179,6 +183,8 @@ def _old_frequency(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> 
 
 def _effect_before(axis: str, step: AddedOrResizedEffect, r: Reconciliation, size_name: str) -> Effect | None:
     """Return the effect of the model under test that a step has changed, or None if the model lacks the effect."""
+    if step.moved_from is not None:
+        return step.moved_from
     known = [effect for effect in r.baseline.effects.get(axis, ()) if effect.name == step.effect]
     identity = find_identifying_parameter(step, axis, r.model)
     name, compared = size_name, step.parameters.get(size_name)

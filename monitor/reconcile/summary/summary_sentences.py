@@ -152,8 +152,9 @@ def describe_finding(finding: RankedGapCause) -> str:
         start, name = ("moved", "frequency") if "frequency" in numbers else ("with a cutoff that moved", "cutoff")
         details[0] = f"{start} from {finding.old_frequency:.4g} to {numbers[name]:.4g} Hz"
     has_new_shape = finding.old_frequency is not None
-    if finding.kind == "retuned" and "bandwidth" in numbers and not has_new_shape:
-        details.append(f"with a bandwidth of {numbers['bandwidth']:.3g} Hz")
+    if finding.kind == "retuned" and not has_new_shape and {"bandwidth", "order"} & numbers.keys():
+        shape = "with a bandwidth of {bandwidth:.3g} Hz" if "bandwidth" in numbers else "of order {order:.0f}"
+        details.append(shape.format(**numbers))
         has_new_shape = True
     if finding.kind == "retuned" and not (has_new_shape and _is_nearly_one(finding.size_ratio)):
         details.append(f"times {finding.size_ratio:.3g}" if finding.size_ratio else "of another size")

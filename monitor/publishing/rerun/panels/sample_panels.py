@@ -89,10 +89,10 @@ def _bucket_ends(order: Ints, bucket: Ints) -> Ints:
     return np.unique(order[first | last])
 
 
-def gap_midpoints(sample_s: Floats, previous_s: float) -> Floats:
+def gap_midpoints(sample_s: Floats, previous_s: float, interval_s: float) -> Floats:
     """Return the middle of each gap, at which the line of the samples is interrupted.
 
-    >>> gap_midpoints(np.array([1.0, 1.1, 1.2, 9.2, 9.3]), 0.9).round(1).tolist()
+    >>> gap_midpoints(np.array([1.0, 1.1, 1.2, 9.2, 9.3]), 0.9, 0.1).round(1).tolist()
     [5.2]
 
     Parameters
@@ -101,10 +101,12 @@ def gap_midpoints(sample_s: Floats, previous_s: float) -> Floats:
         Unix times of the samples [s], shape [n].
     previous_s
         Unix time of the sample before [s].
+    interval_s
+        Typical time between two samples [s].
     """
     before_s = np.concatenate([[previous_s], sample_s[:-1]])
     intervals_s = sample_s - before_s
-    gaps = intervals_s > max(MIN_GAP_S, MIN_GAP_INTERVALS * float(np.median(intervals_s)))
+    gaps = intervals_s > max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
     return np.asarray((before_s + intervals_s / 2.0)[gaps])
 
 
@@ -113,6 +115,7 @@ TEMPERATURES_PER_S: Final = 5.0
 
 class _SamplePanel(Panel):
     _newest_s = float("nan")  # Unix time of the newest sample [s]
+    _interval_s = float("nan")  # smallest median of the time between samples of all batches [s]
 
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
         for axis in axes:
@@ -126,7 +129,11 @@ class _SamplePanel(Panel):
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
         if times.size == 0:
             return times
-        gaps_s = gap_midpoints(times, times[0] if np.isnan(self._newest_s) else self._newest_s)
+        previous_s = float(times[0]) if np.isnan(self._newest_s) else self._newest_s
+        intervals_s = np.diff(times) if np.isnan(self._newest_s) else np.diff(times, prepend=previous_s)
+        if intervals_s.size:
+            self._interval_s = float(np.fmin(self._interval_s, np.median(intervals_s)))
+        gaps_s = gap_midpoints(times, previous_s, self._interval_s)
         self._newest_s = float(times[-1])
         for i, axis in enumerate(axes):
             t, y = decimate_extremes(times, values[:, i])

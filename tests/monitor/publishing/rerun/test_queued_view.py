@@ -96,17 +96,18 @@ def test_recording_contains_the_shown_results(tmp_path: Path) -> None:
     assert times[[0, -1]] / 1e9 == pytest.approx([T0, T0 + 0.99], abs=1e-6)
 
 
-def test_line_of_the_samples_is_interrupted_at_a_gap(tmp_path: Path) -> None:
+@pytest.mark.parametrize("later_samples", [1, 2, 100])
+def test_line_of_the_samples_is_interrupted_at_a_gap(tmp_path: Path, later_samples: int) -> None:
     path = tmp_path / "run.rrd"
     view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
     view.start()
     wait_for(lambda: view.state == "ok")
-    for begin_s in (T0, T0 + 16.0):
-        view.put("bench-1", begin_s, SampleBatch(*example_results.simulate_samples(begin_s, 1.0)))
+    for begin_s, count in ((T0, 100), (T0 + 16.0, later_samples)):
+        view.put("bench-1", begin_s, SampleBatch(*example_results.simulate_samples(begin_s, count / 100.0)))
     view.close()
     gz = read_column_values(read_entities(path)["/bench-1/samples/gz"], "Scalars:scalars")
     assert np.flatnonzero(np.isnan(gz)).tolist() == [100]
-    assert gz.size == 201
+    assert gz.size == 101 + later_samples
 
 
 def test_state_before_the_first_sample_has_no_time(tmp_path: Path) -> None:

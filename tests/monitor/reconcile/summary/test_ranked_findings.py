@@ -111,6 +111,7 @@ def test_moved_resonance_states_the_old_frequency():
     effects = (Narrowband(1e-3, 8.0, 0.5), Narrowband(2e-3, 20.0, 0.5))
     moved = make_step("narrowband", 10.0, kind="retuned", sigma=around(2e-3, 1e-5), frequency=around(19.5, 0.01))
     model = NoiseModel({"gx": (effects[0], replace(effects[1], frequency=19.5))})
+    moved = replace(moved, moved_from=effects[1])
     (one,) = rank_findings(replace(make_result({"gx": [moved]}, effects=effects), model=model)).findings
     assert (one.old_frequency, one.size_ratio) == (20.0, pytest.approx(1.0))
 
@@ -121,11 +122,31 @@ def test_changed_cutoff_of_both_triads_is_one_finding():
         axis: [make_step("bandwidth_limit", 10.0, kind="retuned", floor=around(1e-5, 0.0), cutoff=around(20.0, 0.1))]
         for axis in ("gx", "ax")
     }
+    steps = {axis: [replace(step, moved_from=known) for step in found] for axis, found in steps.items()}
     r = make_result(steps, effects=(known,))
     r = replace(r, model=NoiseModel(dict.fromkeys(steps, (changed,))))
     (one,) = rank_findings(r).findings
     assert (one.axes, one.old_frequency) == (("gx", "ax"), 40.0)
     assert describe_finding(one) == "low-pass filter with a cutoff that moved from 40 to 20 Hz on gx and ax"
+
+
+@pytest.mark.parametrize(("gyro", "accel"), [(1.05, 0.97), (1.08, 1.08)])
+def test_changed_sizes_of_two_triads_are_two_findings(gyro, accel):
+    steps = {
+        axis: [make_step("angle_random_walk", 10.0, kind="retuned", N=around(N * ratio, N * 0.01))]
+        for axis, ratio in (("gx", gyro), ("ax", accel))
+    }
+    assert [one.axes for one in rank_findings(make_result(steps)).findings] == [("gx",), ("ax",)]
+
+
+def test_filter_of_another_order_states_the_order():
+    known = BandwidthLimit(cutoff=28.0, order=1)
+    step = make_step("bandwidth_limit", 10.0, kind="retuned", cutoff=around(28.0, 0.2), order=2.0)
+    r = make_result({"gx": [replace(step, moved_from=known)]}, effects=(known,))
+    r = replace(r, model=NoiseModel({"gx": (replace(known, order=2),)}))
+    (one,) = rank_findings(r).findings
+    assert one.old_frequency is None
+    assert describe_finding(one) == "low-pass filter with a cutoff of 28 Hz of order 2 on gx"
 
 
 def test_shares_of_findings_and_remaining_gaps_sum_to_one():
