@@ -102,8 +102,8 @@ def test_line_of_the_samples_is_interrupted_at_a_gap(tmp_path: Path, later_sampl
     view = RerunView(ViewerSettings(mode=str(path)), DEVICE)
     view.start()
     wait_for(lambda: view.state == "ok")
-    for begin_s, count in ((T0, 100), (T0 + 16.0, later_samples)):
-        view.put("bench-1", begin_s, SampleBatch(*example_results.simulate_samples(begin_s, count / 100.0)))
+    for begin_s, samples in ((T0, 100), (T0 + 16.0, later_samples)):
+        view.put("bench-1", begin_s, SampleBatch(*example_results.simulate_samples(begin_s, samples / 100.0)))
     view.close()
     gz = read_column_values(read_entities(path)["/bench-1/samples/gz"], "Scalars:scalars")
     assert np.flatnonzero(np.isnan(gz)).tolist() == [100]
