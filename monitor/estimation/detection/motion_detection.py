@@ -62,6 +62,7 @@ class MotionDetector:
     rate_hz : float
         Sample rate in Hz.
 
+    >>> from drivers.data_types import make_block
     >>> rest = MotionDetector(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
     >>> still[1000:1200, 0] += np.sin(np.arange(200) / 20)
