@@ -364,6 +364,15 @@ def test_other_bandwidth_of_a_resonance_is_no_new_effect():
     assert resonance.sigma == pytest.approx(4e-4, rel=0.1)
 
 
+def test_second_of_two_resonances_that_moved_is_named():
+    first, second = (Narrowband(sigma=4e-4, frequency=f, bandwidth=0.5) for f in (17.3, 30.0))
+    true = NoiseModel({"gz": (*MODEL, first, replace(second, frequency=20.0))}).simulate(n, RATE_HZ, 41)
+    found = search_axis(true[:, 2].copy(), (*MODEL, first, second))
+    (step,) = (one for one in build_axis_result(found, STRICT, STRICT).steps if one.moved_from is not None)
+    assert step.moved_from.frequency == 30.0
+    assert step.parameters["frequency"].value == pytest.approx(20.0, abs=0.2)
+
+
 def test_factor_of_an_axis_with_a_filter_also_multiplies_the_noise_after_the_filter():
     model = (*MODEL, BandwidthLimit(cutoff=15.0, order=1, floor=0.3 * N, kind="butterworth"))
     true = NoiseModel({"gz": model}).simulate(n, RATE_HZ, 36)[:, 2]
