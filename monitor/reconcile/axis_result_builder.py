@@ -131,8 +131,8 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
             found.append((at, index, "added"))
         last_round = at == len(search.rounds) - 1
         for noise in sorted(resized):
-            if noise in one.hypothesis.fit.fitted_noise or last_round:
-                found.append((at, noise, "retuned" if effect_size(hypothesis.effects[noise]) > 0.0 else "absent"))
+            if noise not in one.hypothesis.fit.fixed_sizes or last_round:
+                found.append((at, noise, "retuned" if effect_size(hypothesis.effects[noise]) != 0.0 else "absent"))
                 resized.discard(noise)
     return found
 
@@ -157,7 +157,7 @@ def _describe_step(
 ) -> AddedOrResizedEffect:
     effect, trial = search.hypothesis.effects[index], done.trials[0]
     moved = trial.moved == index
-    gap = _triggering_gap(effect, "added" if moved else kind, before)
+    gap = _triggering_gap(effect, before)
     later = _gap_of(gap.diagnostic, after)
     trials = _trials_not_added_too(search.hypothesis, index, done.trials)
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" or moved else RETUNE, trials)
@@ -179,14 +179,14 @@ def _describe_step(
     )
 
 
-def _triggering_gap(effect: Effect, kind: StepKind, before: AxisModelDiagnostics) -> DiagnosticGap:
+def _triggering_gap(effect: Effect, before: AxisModelDiagnostics) -> DiagnosticGap:
     """Return the difference between recording and model that led to an effect.
 
     A significant difference in the most sensitive diagnostic of the effect is preferred. Otherwise, the difference with
     the largest ratio to the threshold is returned.
     """
     significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
-    most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
+    most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name)
     for gap in significant:
         if gap.diagnostic == most_direct:
             return gap
@@ -251,6 +251,8 @@ def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
     """Return the probability that the true size of an effect differs from the size in the model."""
     now, before = effect_size(hypothesis.effects[index]), effect_size(hypothesis.model[index])
     error = hypothesis.fit.size_standard_error(index)
+    if hypothesis.effects[index].name in SERIES_SIZE_PARAMETERS and error > 0.0:
+        return erf(abs(now - before) / error / 2.0**0.5)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # one of the sizes is zero
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
@@ -288,12 +290,10 @@ def _parameters_with_bounds(
 
 
 def _coefficient_bounds(hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
-    fitted = hypothesis.fit.whittle
-    column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start
-    column += linear_coefficient_names(hypothesis.effects[index]).index(name)
-    value = float(fitted.beta[column])
-    error = Z95 * float(fitted.beta_covariance[column, column]) ** 0.5
-    return ParameterInterval(value, value - error, value + error)
+    effect = hypothesis.effects[index]
+    value = float(getattr(effect, name))
+    error = hypothesis.fit.coefficient_standard_errors(index)[linear_coefficient_names(effect).index(name)]
+    return ParameterInterval(value, value - Z95 * float(error), value + Z95 * float(error))
 
 
 EVIDENCE_TEXT: Final = {

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from drivers.data_types import AXES
-from monitor.noise.effect import AxisLeak, Effect
+from monitor.noise.effect import Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     BandwidthLimit,
@@ -37,7 +37,7 @@ from monitor.reconcile.diagnostics.null_distribution import (
 from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_roles import is_stationary_gaussian, with_effect_size
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_model_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes, select_axes_and_smooth_temperature
 from monitor.reconcile.recording_checks.checks import check_recording, sort_findings
@@ -56,6 +56,10 @@ from monitor.reconcile.result import (
 )
 from monitor.reconcile.search.backward_elimination import MapFunction, eliminate_unneeded_effects
 from monitor.reconcile.search.common_vibration_search import name_common_vibrations
+from monitor.reconcile.search.leak_direction import (
+    add_opposite_leaks_as_alternatives,
+    find_leaks_in_wrong_direction,
+)
 from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
@@ -251,7 +255,7 @@ def _diagnose_simulation(
     axes = _simulate_axes(model, run, effects, seed)
 
     def diagnose_axis(name: str) -> Findings:
-        return run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit))
+        return run_diagnostics(whiten_axis(fit_with_model_sizes(axes[name], effects[name]).fit))
 
     return dict(zip(names, run.map_function(diagnose_axis, names), strict=True))
 
@@ -297,33 +301,13 @@ def _search_all_axes(
         run.report_stage(stage, min(next(searched) / len(axes), 1.0))
         return result
 
-    found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
-    for name, wrong in _reversed_leak_sources(found, null).items():
+    first_found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
+    found = dict(first_found)
+    for name, wrong in find_leaks_in_wrong_direction(first_found, null).items():
         leak_sources = {source: one for source, one in axes[name].leak_sources.items() if source not in wrong}
         axes[name] = replace(axes[name], leak_sources=leak_sources)
         found[name] = search_named_axis(name)
-    return _AxesSearchResult(found, error)
-
-
-def _reversed_leak_sources(
-    found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
-) -> dict[str, frozenset[str]]:
-    """Return the leak sources of each axis for which a leak in the opposite direction is more likely."""
-    gains = {
-        (name, effect.source): step.trials[0].score
-        for name, one in found.items()
-        for step in one.rounds
-        if isinstance(effect := step.trials[0].effect, AxisLeak)
-    }
-    back: dict[str, frozenset[str]] = {}
-    for (name, source), gain in gains.items():
-        if source not in found:
-            continue
-        finding = found[source].final.findings["other_axes"]
-        suspected = finding.where.source == name and finding.gain > null[source]["other_axes"].threshold
-        if suspected or gains.get((source, name), np.inf) < gain:
-            back[source] = back.get(source, frozenset()) | {name}
-    return back
+    return _AxesSearchResult(add_opposite_leaks_as_alternatives(found, first_found), error)
 
 
 def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseModel:

@@ -4,9 +4,10 @@ The fit maximises the Whittle likelihood over the sizes of the effects. Many can
 so the regressors and the sums over frequency bins are cached.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from math import prod, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from monitor.noise.effects import (
     RateRamp,
     Resolution,
     Saturation,
+    ScaleFactor,
     Sinusoidal,
     TemperatureBias,
     TemperatureLag,
@@ -32,9 +34,11 @@ from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.effect_roles import (
     MAX_REGRESSORS,
+    UNSIGNED_SERIES,
     build_unit_regressors,
     effect_size,
     is_noise_effect,
+    regression_coefficients,
     regressor_count,
     with_effect_size,
     with_regression_coefficients,
@@ -69,6 +73,8 @@ WHOLE_RECORDING: Final = slice(None)
 MAX_CACHED_PRODUCTS: Final = 2048
 MAX_CACHED_BASES: Final = 512
 MAX_CACHED_UNIT_EFFECTS: Final = 4096
+MIN_LINE_POWER_GAIN: Final = 1e-6
+"""Smallest assumed power gain of a filter for a line. A smaller gain would give a huge amplitude before the filter."""
 INITIAL_FLOOR_RATIO: Final = 1e-3
 """Smallest starting value of the white noise added after a low-pass filter, relative to the total power."""
 Effects = tuple[Effect, ...]
@@ -225,7 +231,7 @@ class Axis:
     def fit(
         self,
         effects: Sequence[Effect],
-        fixed_noise: frozenset[int] = frozenset(),
+        fixed_sizes: frozenset[int] = frozenset(),
     ) -> "AxisFit":
         """Fit the sizes of effects to the axis by maximum likelihood.
 
@@ -233,8 +239,9 @@ class Axis:
         ----------
         effects : sequence of Effect
             Effects to fit. The sizes are starting values, and the shape parameters stay fixed.
-        fixed_noise : frozenset of int, optional
-            Indices of the noise effects whose size is fixed.
+        fixed_sizes : frozenset of int, optional
+            Indices of the effects whose size is fixed. The phase of a sinusoid and the sign of a ramp are always
+            fitted, because they differ between recordings.
 
         Returns
         -------
@@ -242,19 +249,31 @@ class Axis:
             Fitted sizes and log-likelihood.
         """
         transforms = _spectral_transforms(effects, self.value_artifacts)
-        noise = self._noise_variances(effects, fixed_noise, transforms)
+        noise = self._noise_variances(effects, fixed_sizes, transforms)
         slices, columns = self._regressors_of(effects)
-        fitted = maximise_whittle_likelihood(
-            self.used_count,
-            self.sum_products_over_bins(columns),
-            np.asarray(noise.bases).reshape(len(noise.bases), self.bins.count.size),
-            noise.constant,
-            np.asarray(noise.start, np.float64),
+        gains = tuple(_amplitude_gain(effects[at], transforms, 1.0 / self.rate_hz) for at, _ in slices)
+        bases = np.asarray(noise.bases).reshape(len(noise.bases), self.bins.count.size)
+
+        def fit_sizes(sums: BinnedRegressionSums) -> WhittleFit:
+            start = np.asarray(noise.start, np.float64)
+            return maximise_whittle_likelihood(self.used_count, sums, bases, noise.constant, start)
+
+        sums = self.sum_products_over_bins(columns)
+        known = [
+            (effects[at], place, gain) for (at, place), gain in zip(slices, gains, strict=True) if at in fixed_sizes
+        ]
+        if not known:
+            fitted = fit_sizes(sums)
+        else:
+            is_unsigned = any(isinstance(effect, UNSIGNED_SERIES) for effect, _, _ in known)
+            free_beta = fit_sizes(sums).beta if is_unsigned else np.zeros(len(columns))
+            fitted = _fit_with_fixed_regressors(fit_sizes, sums, _fixed_beta(known, free_beta))
+        return AxisFit(
+            self, tuple(effects), fixed_sizes, fitted.log_likelihood, fitted, tuple(noise.fitted), slices, gains
         )
-        return AxisFit(self, tuple(effects), fixed_noise, fitted.log_likelihood, fitted, tuple(noise.fitted), slices)
 
     def _noise_variances(
-        self, effects: Sequence[Effect], fixed_noise: frozenset[int], transforms: Sequence[Transform]
+        self, effects: Sequence[Effect], fixed_sizes: frozenset[int], transforms: Sequence[Transform]
     ) -> _NoiseVariances:
         constant = self._variance_of_transforms(transforms).copy()
         found = _NoiseVariances([], [], [], constant)
@@ -262,7 +281,7 @@ class Axis:
             if not is_noise_effect(effect):
                 continue
             basis = self.variance_basis(effect, effects, transforms)
-            if at in fixed_noise:
+            if at in fixed_sizes:
                 constant += effect_size(effect) ** 2 * basis
             else:
                 found.fitted.append(at)
@@ -356,16 +375,33 @@ class AxisFit:
 
     axis: Axis
     start_effects: Effects  # with the starting values of the sizes
-    fixed_noise: frozenset[int]  # indices of effects whose size was not fitted
+    fixed_sizes: frozenset[int]  # indices of effects whose size was not fitted
     log_likelihood: float
     whittle: WhittleFit
     fitted_noise: tuple[int, ...]  # index in ``effects`` of each fitted θ
     regressor_slices: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
+    regressor_gains: tuple[float, ...]  # gain of the transforms for each of these effects; β = gain times coefficient
 
     @cached_property
     def effects(self) -> Effects:
         """Effects with the fitted sizes."""
-        return _with_fitted_sizes(self.start_effects, self.fitted_noise, self.regressor_slices, self.whittle)
+        found = list(self.start_effects)
+        for theta, at in zip(self.whittle.theta, self.fitted_noise, strict=True):
+            found[at] = with_effect_size(found[at], float(theta) ** 0.5)
+        for (at, place), gain in zip(self.regressor_slices, self.regressor_gains, strict=True):
+            fitted = with_regression_coefficients(found[at], self.whittle.beta[place] / gain)
+            if at not in self.fixed_sizes:
+                found[at] = fitted
+            elif isinstance(found[at], Sinusoidal):  # the phase is fitted
+                found[at] = with_effect_size(fitted, effect_size(found[at]))
+        return tuple(found)
+
+    def coefficient_standard_errors(self, effect_index: int) -> Floats:
+        """Return the standard error of each coefficient of a deterministic effect, shape (q,)."""
+        for (at, place), gain in zip(self.regressor_slices, self.regressor_gains, strict=True):
+            if at == effect_index:
+                return np.asarray(np.sqrt(np.diag(self.whittle.beta_covariance)[place]) / gain)
+        raise ValueError(f"effect {effect_index} is not deterministic")
 
     def size_standard_error(self, effect_index: int) -> float:
         """Return the standard error of the size of an effect, or NaN if the size was not fitted."""
@@ -374,12 +410,11 @@ class AxisFit:
             covariance = np.linalg.pinv(self.whittle.theta_information)
             theta = float(self.whittle.theta[noise])
             return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
-        for at, place in self.regressor_slices:
-            if at == effect_index:
-                variances = np.diag(self.whittle.beta_covariance)[place]
-                # the two regressors of a sinusoid have equal errors
-                sinusoid = isinstance(self.effects[at], Sinusoidal)
-                return float(np.sqrt(variances.mean() if sinusoid else variances[0]))
+        if any(at == effect_index for at, _ in self.regressor_slices):
+            errors = self.coefficient_standard_errors(effect_index)
+            # the two regressors of a sinusoid have equal errors
+            sinusoid = isinstance(self.start_effects[effect_index], Sinusoidal)
+            return float(np.sqrt(np.mean(errors**2)) if sinusoid else errors[0])
         return float("nan")
 
     def noise_variance(self, effect_index: int) -> Floats:
@@ -446,15 +481,58 @@ def _spectral_transforms(effects: Sequence[Effect], statistics: ValueArtifacts) 
     return sorted(found, key=lambda effect: TRANSFORM_ORDER.index(type(effect)))
 
 
-def _with_fitted_sizes(
-    effects: Sequence[Effect], noises: Sequence[int], slices: Sequence[tuple[int, slice]], fitted: WhittleFit
-) -> Effects:
-    found = list(effects)
-    for theta, at in zip(fitted.theta, noises, strict=True):
-        found[at] = with_effect_size(found[at], float(theta) ** 0.5)
-    for at, place in slices:
-        found[at] = with_regression_coefficients(found[at], fitted.beta[place])
-    return tuple(found)
+def _fixed_beta(known: Sequence[tuple[Effect, slice, float]], free_beta: Floats) -> Floats:
+    """Return β with the fixed sizes of some effects, and NaN for all other regressors, shape (q,).
+
+    Parameters
+    ----------
+    known : sequence of (Effect, slice, float)
+        Each effect with a fixed size, its slice of β and the gain of the transforms.
+    free_beta : ndarray of float64, shape (q,)
+        β of the fit without fixed sizes, which determines signs and phases.
+    """
+    beta = np.full(free_beta.size, np.nan)
+    for effect, place, gain in known:
+        beta[place] = gain * regression_coefficients(effect)
+        if isinstance(effect, UNSIGNED_SERIES):
+            direction = free_beta[place] / max(float(np.linalg.norm(free_beta[place])), 1e-300)
+            beta[place] = gain * effect_size(effect) * direction
+    return beta
+
+
+def _fit_with_fixed_regressors(
+    fit_sizes: Callable[[BinnedRegressionSums], WhittleFit], sums: BinnedRegressionSums, fixed_beta: Floats
+) -> WhittleFit:
+    """Fit with given values of some β. The values to be fitted are NaN in ``fixed_beta``."""
+    free = np.flatnonzero(np.isnan(fixed_beta))
+    beta = np.nan_to_num(fixed_beta)
+    fitted = fit_sizes(
+        BinnedRegressionSums(
+            np.maximum(sums.power - 2.0 * beta @ sums.cross + np.einsum("i,j,ijb->b", beta, beta, sums.gram), 0.0),
+            sums.cross[free] - np.einsum("j,ijb->ib", beta, sums.gram[free]),
+            sums.gram[np.ix_(free, free)],
+        )
+    )
+    beta[free] = fitted.beta
+    information = np.zeros((beta.size, beta.size))
+    information[np.ix_(free, free)] = fitted.beta_information
+    return replace(fitted, beta=beta, beta_information=information)
+
+
+def _amplitude_gain(effect: Effect, transforms: Sequence[Transform], tau0_s: float) -> float:
+    """Return the factor by which filters and scale factors change the amplitude of a deterministic effect.
+
+    Filters only attenuate lines, because all other effects are slow, or are leaks of samples that are already filtered.
+    """
+    scales = [one for one in transforms if isinstance(one, (BandwidthLimit, ScaleFactor))]
+    if not scales:
+        return 1.0
+    if not isinstance(effect, Sinusoidal):
+        return float(prod(one.factor for one in scales if isinstance(one, ScaleFactor)))
+    spectrum = white_noise_spectrum(1.0 / tau0_s, tau0_s)
+    for one in scales:
+        spectrum = one.transform_spectrum(spectrum)
+    return sqrt(max(float(spectrum.density(np.array([effect.frequency]))[0]), MIN_LINE_POWER_GAIN))
 
 
 def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: FrequencyBins) -> Floats:

@@ -7,7 +7,7 @@ is the product of size and **regressor**. The regressor of an ``AxisLeak`` is an
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import atan2, copysign, hypot, pi
+from math import atan2, copysign, cos, hypot, pi, sin
 from typing import Any, Final
 
 import numpy as np
@@ -26,11 +26,18 @@ from monitor.noise.effects import (
     ScaleFactor,
     Sinusoidal,
 )
-from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, NOISE_SIZE_PARAMETERS, SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import (
+    EFFECT_PROPERTIES,
+    NOISE_SIZE_PARAMETERS,
+    ONE_TIME_EFFECTS,
+    SIZE_PARAMETERS,
+)
 
 MAX_REGRESSORS: Final = 3
 """Largest number of regressors of an effect."""
 
+UNSIGNED_SERIES: Final = (RateRamp, Sinusoidal)
+"""Deterministic effects whose sign or phase differs between recordings."""
 NON_GAUSSIAN_NOISES: Final = (PoissonSteps, RandomTelegraph)
 GAUSSIAN_TRANSFORMS: Final = (BandwidthLimit, ConstantBias, Resolution, SampleRateError, ScaleFactor)
 """Effects without a size that keep Gaussian noise Gaussian and stationary. Quantization does so with small steps."""
@@ -53,6 +60,31 @@ def regressor_count(effect: Effect) -> int:
 def is_noise_effect(effect: Effect) -> bool:
     """Return True if an effect adds noise, whose size is a parameter of the effect."""
     return getattr(effect, NOISE_SIZE_PARAMETERS.get(effect.name, ""), None) is not None
+
+
+def has_lasting_size(effect: Effect) -> bool:
+    """Return True if the size of an effect is a property of the sensor, and therefore equal in all its recordings.
+
+    This excludes the sizes of events that happen only once.
+    """
+    is_series = effect.name in SIZE_PARAMETERS and effect.name not in NOISE_SIZE_PARAMETERS
+    return is_noise_effect(effect) or (is_series and effect.name not in ONE_TIME_EFFECTS)
+
+
+def has_same_size(a: Effect, b: Effect) -> bool:
+    """Return True if two effects with the same name have equal sizes and equal linear coefficients."""
+    return all(getattr(a, name) == getattr(b, name) for name in EFFECT_PROPERTIES[a.name].sizes)
+
+
+def regression_coefficients(effect: Effect) -> Floats:
+    """Return the coefficient of each regressor of a deterministic effect, shape (q,).
+
+    For a sinusoid, the phase is zero if it is unknown.
+    """
+    if isinstance(effect, Sinusoidal):
+        phase = effect.phase or 0.0
+        return effect.amplitude * np.array([cos(phase), sin(phase)])
+    return np.array([getattr(effect, name) for name in linear_coefficient_names(effect)], np.float64)
 
 
 def is_stationary_gaussian(effects: Sequence[Effect]) -> bool:
@@ -85,7 +117,7 @@ def with_effect_size(effect: Effect, size: float) -> Effect:
     name = SIZE_PARAMETERS[effect.name]
     if isinstance(effect, CommonVibration):
         return replace(effect, gain=copysign(size, effect.gain))
-    unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or effect.name in NOISE_SIZE_PARAMETERS
+    unsigned = isinstance(effect, UNSIGNED_SERIES) or effect.name in NOISE_SIZE_PARAMETERS
     return replace(effect, **{name: abs(size) if unsigned else size})  # type: ignore[type-var]
 
 

@@ -24,7 +24,12 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effect, with_effect_size
+from monitor.reconcile.likelihood.effect_roles import (
+    effect_size,
+    has_lasting_size,
+    is_noise_effect,
+    with_effect_size,
+)
 from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.result import ParameterInterval
@@ -79,8 +84,8 @@ class Hypothesis:
 
     @property
     def resized_model_effect_count(self) -> int:
-        """Number of noise effects of the model with a fitted size."""
-        return sum(at < self.model_effect_count for at in self.fit.fitted_noise)
+        """Number of effects of the model with a fitted size that the model determines."""
+        return len(indices_of_lasting_sizes(self.axis, self.model) - self.fit.fixed_sizes)
 
     @property
     def resize_penalty(self) -> float:
@@ -97,11 +102,11 @@ class Hypothesis:
         return fit_with_fewest_changes(self.axis, added, self.model)
 
 
-def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
-    """Fit the deterministic effects of a noise model and keep the sizes of the noise effects.
+def fit_with_model_sizes(axis: Axis, model: Effects) -> Hypothesis:
+    """Fit what differs between recordings, and keep the sizes that the model determines.
 
-    The sizes of deterministic effects, the delays of pulses, the phases of modulations and the mean of a random
-    variance differ between recordings.
+    The sizes of events that happen once, the delays of pulses, the phases of lines and modulations, and the mean of a
+    random variance differ between recordings.
 
     Parameters
     ----------
@@ -111,7 +116,21 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
         Effects of the axis in the model under test.
     """
     model = _with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
-    return Hypothesis(model, axis.fit(model, noise_effect_indices(model)))
+    return Hypothesis(model, axis.fit(model, indices_of_lasting_sizes(axis, model)))
+
+
+def fit_deterministic_effects(axis: Axis, model: Effects) -> AxisFit:
+    """Fit the deterministic effects of a noise model, and keep the sizes of the noise effects.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
+    model = _with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
+    return axis.fit(model, noise_effect_indices(model))
 
 
 def _lacks_timing(effect: Effect) -> bool:
@@ -185,21 +204,39 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
     """
     effects = (*model, *added)
     common = frozenset(len(model) + at for at, effect in enumerate(added) if isinstance(effect, CommonVibration))
-    fixed_noise = noise_effect_indices(model) | common
-    best = Hypothesis(model, axis.fit(effects, fixed_noise))
-    if fixed_noise == common:
+    fixed_sizes = indices_of_lasting_sizes(axis, model) | common
+    best = Hypothesis(model, axis.fit(effects, fixed_sizes))
+    if fixed_sizes == common:
         return best
     free = Hypothesis(model, axis.fit(effects, common))
     if free.fit.log_likelihood - best.fit.log_likelihood < RESIZE_PENALTY_NATS:
         return best
-    while fixed_noise > common:
-        trials = [Hypothesis(model, axis.fit(effects, fixed_noise - {at})) for at in sorted(fixed_noise - common)]
+    while fixed_sizes > common:
+        trials = [Hypothesis(model, axis.fit(effects, fixed_sizes - {at})) for at in sorted(fixed_sizes - common)]
         better = max(trials, key=lambda one: one.penalised_log_likelihood)
         if better.penalised_log_likelihood <= best.penalised_log_likelihood:
             break
-        best, fixed_noise = better, better.fit.fixed_noise
+        best, fixed_sizes = better, better.fit.fixed_sizes
     # the loop fits one more size at a time and cannot find two sizes that improve the fit only together
     return free if free.penalised_log_likelihood > best.penalised_log_likelihood else best
+
+
+def indices_of_lasting_sizes(axis: Axis, model: Effects) -> frozenset[int]:
+    """Return the indices of the effects whose size the model determines for each recording of the sensor.
+
+    If the model was fitted to the same recording, the deterministic effects are fitted again together with added
+    effects, so only the sizes of noise effects are included.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis of the recording.
+    model : tuple of Effect
+        Effects of the axis in the model under test.
+    """
+    if axis.is_model_fitted:
+        return noise_effect_indices(model)
+    return frozenset(at for at, effect in enumerate(model) if has_lasting_size(effect))
 
 
 def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
@@ -363,7 +400,7 @@ def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str)
     def is_likely(log_factor: float) -> bool:
         shaped = with_shape(effect, parameter_name, value * exp(log_factor))
         changed = (*effects[:effect_index], shaped, *effects[effect_index + 1 :])
-        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood < limit_nats
+        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_sizes).log_likelihood < limit_nats
 
     ends = []
     for sign in (-1.0, 1.0):

@@ -32,13 +32,13 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull
 from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, PENALTY_NATS, SIZE_PARAMETERS
-from monitor.reconcile.likelihood.effect_roles import effect_size, with_effect_size
+from monitor.reconcile.likelihood.effect_roles import effect_size, has_same_size
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
     Hypothesis,
     compute_size_interval,
     find_maximum_by_golden_section,
-    noise_effect_indices,
+    indices_of_lasting_sizes,
 )
 from monitor.reconcile.recording_checks.checks import TRIADS
 from monitor.reconcile.search.candidate_effects import fit_resonance
@@ -211,33 +211,39 @@ def revert_insignificant_size_changes(hypothesis: Hypothesis) -> Hypothesis:
             break
         hypothesis = max(unneeded.values(), key=lambda one: one.fit.log_likelihood)
     for at in changed_sizes(hypothesis):
-        if effect_size(hypothesis.effects[at]) > 0.0:
-            absent = _with_size(hypothesis, at, with_effect_size(hypothesis.model[at], 0.0))
+        if effect_size(hypothesis.effects[at]) != 0.0:
+            absent = _with_size(hypothesis, at, _with_zero_size(hypothesis.model[at]))
             if hypothesis.fit.log_likelihood - absent.fit.log_likelihood < HALF_CHI2_95:
                 hypothesis = absent
     return hypothesis
 
 
+def _with_zero_size(effect: Effect) -> Effect:
+    names = [name for name in EFFECT_PROPERTIES[effect.name].sizes if getattr(effect, name) is not None]
+    zero: Effect = replace(effect, **dict.fromkeys(names, 0.0))  # type: ignore[type-var]
+    return zero
+
+
 def changed_sizes(hypothesis: Hypothesis) -> list[int]:
-    """Return the indices of the noise effects of the model whose size was changed."""
+    """Return the indices of the effects of the model whose size was changed."""
     return [
         at
-        for at in sorted(noise_effect_indices(hypothesis.model))
-        if effect_size(hypothesis.effects[at]) != effect_size(hypothesis.model[at])
+        for at in sorted(indices_of_lasting_sizes(hypothesis.axis, hypothesis.model))
+        if not has_same_size(hypothesis.effects[at], hypothesis.model[at])
     ]
 
 
 def _with_size(hypothesis: Hypothesis, index: int, effect: Effect) -> Hypothesis:
     """Fit the hypothesis with a fixed size of one effect."""
     effects = (*hypothesis.effects[:index], effect, *hypothesis.effects[index + 1 :])
-    return Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise | {index}))
+    return Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, hypothesis.fit.fixed_sizes | {index}))
 
 
 def _differs_significantly(hypothesis: Hypothesis, index: int, with_old_size: Hypothesis) -> bool:
     if hypothesis.fit.log_likelihood - with_old_size.fit.log_likelihood < RESIZE_PENALTY_NATS:
         return False
     interval = compute_size_interval(hypothesis.fit, index)
-    if interval.lo is None or interval.hi is None:
+    if interval.lo is None or interval.hi is None or len(EFFECT_PROPERTIES[hypothesis.effects[index].name].sizes) > 1:
         return True
     return not interval.lo <= effect_size(hypothesis.model[index]) <= interval.hi
 
@@ -283,4 +289,5 @@ def _with_factor(hypothesis: Hypothesis, factor: float) -> Hypothesis:
     """Fit the hypothesis with the old sizes of the noise model times a common factor."""
     added = tuple(effect for effect in hypothesis.added if not isinstance(effect, ScaleFactor))
     effects = (*hypothesis.model, *added, ScaleFactor(factor=factor))
-    return Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, noise_effect_indices(hypothesis.model)))
+    fixed_sizes = indices_of_lasting_sizes(hypothesis.axis, hypothesis.model)
+    return Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, fixed_sizes))

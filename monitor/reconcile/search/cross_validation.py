@@ -30,7 +30,7 @@ from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.effect_properties import ONE_TIME_EFFECTS, SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit
-from monitor.reconcile.likelihood.effect_roles import linear_coefficient_names
+from monitor.reconcile.likelihood.effect_roles import regression_coefficients
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform, inverse_cosine_transform
@@ -108,12 +108,12 @@ def cross_validate(
     if learned.kept or added_effect is None:
         return learned
     # a drift that differs between the halves must not outweigh the effect, so the other noise is fitted to each half
-    others = frozenset(range(len(after.effects) - 1)) - after.fit.fixed_noise
+    others = frozenset(range(len(after.effects) - 1)) - after.fit.fixed_sizes
     return _exchange_halves(repaired, before, after, others, diagnostic, null)
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
-    return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
+    return half.fit(hypothesis.effects, hypothesis.fit.fixed_sizes)
 
 
 def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, diagnostic: str) -> float:
@@ -165,16 +165,17 @@ def _half_axis(axis: Axis, part: slice, sources: Collection[str]) -> Axis:
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
-    """Return the expected log-likelihood gain, in nats, of a deterministic effect.
+    """Return the expected log-likelihood gain, in nats, of a deterministic effect, which is the last of the fit.
 
     The gain is ½ Σ s²/v, where s is the transform of the effect and v is the variance of the noise.
     """
     half = fit.axis
     columns = half.regressor_cosine_transforms(effect)
     weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)[: columns[0].size]
+    gain = fit.regressor_gains[-1]
     if isinstance(effect, Sinusoidal):
-        return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
-    factors = [getattr(effect, name) for name in linear_coefficient_names(effect)]
+        return 0.5 * (gain * effect.amplitude) ** 2 * float((columns[0] ** 2 * weight).sum())
+    factors = gain * regression_coefficients(effect)
     made = sum(factor * column for factor, column in zip(factors, columns, strict=True))
     return 0.5 * float((made**2 * weight).sum())
 
@@ -192,10 +193,10 @@ def _predict_half(half: Axis, learned: AxisFit, fitted: frozenset[int]) -> AxisF
     free = half.fit(effects, noise_effect_indices(effects) - fitted)
     beta = free.whittle.beta.copy()
     known: list[int] = []
-    for at, place in free.regressor_slices:
+    for (at, place), gain in zip(free.regressor_slices, free.regressor_gains, strict=True):
         effect = effects[at]
         if isinstance(effect, Sinusoidal):  # keep the fitted phase and use the learned amplitude
-            beta[place] *= effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
+            beta[place] *= gain * effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
         else:
             known += range(place.start, place.stop)
     free = free.with_regressor_sizes(beta)

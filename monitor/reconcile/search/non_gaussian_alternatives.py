@@ -145,9 +145,9 @@ def choose_poisson_steps_or_telegraph(hypothesis: Hypothesis) -> NonGaussianAlte
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
     # a random walk with the fitted size would contain the power of a telegraph
-    bare, fixed_noise = _with_original_walks(hypothesis)
-    for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_noise).effects):
-        other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_noise))
+    bare, fixed_sizes = _with_original_walks(hypothesis)
+    for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_sizes).effects):
+        other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_sizes))
         if effect_size(other.added[-1]) == 0.0:
             continue
         telegraph = fit_telegraph_alternative(other, len(other.effects) - 1)
@@ -169,10 +169,10 @@ def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int
     known = [
         hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.model_effect_count)
     ]
-    fixed_noise = frozenset(
-        at for at in range(hypothesis.model_effect_count) if at in hypothesis.fit.fixed_noise or at in walks
+    fixed_sizes = frozenset(
+        at for at in range(hypothesis.model_effect_count) if at in hypothesis.fit.fixed_sizes or at in walks
     )
-    return (*known, *(one for one in hypothesis.added if not isinstance(one, WALK_EFFECTS))), fixed_noise
+    return (*known, *(one for one in hypothesis.added if not isinstance(one, WALK_EFFECTS))), fixed_sizes
 
 
 def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussianAlternative | None:
@@ -212,10 +212,10 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
     walks = [at for at, effect in enumerate(hypothesis.effects) if isinstance(effect, RateRandomWalk)]
     if not steps and not any(at >= hypothesis.model_effect_count or at in hypothesis.fit.fitted_noise for at in walks):
         return None
-    effects, fixed_noise = _with_original_walks(hypothesis)
-    without = hypothesis.axis.fit(effects, fixed_noise)
+    effects, fixed_sizes = _with_original_walks(hypothesis)
+    without = hypothesis.axis.fit(effects, fixed_sizes)
     known = max((effect_size(effects[at]) for at in walks if at < hypothesis.model_effect_count), default=0.0)
-    walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
+    walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_sizes)
     excess = effect_size(walk.effects[-1])
     background = build_background_noise(without.effects)
     if not (excess > 0.0 and background.white > 0.0):
@@ -253,7 +253,7 @@ def compare_poisson_with_added_noise(hypothesis: Hypothesis) -> NonGaussianAlter
     ]
     others = [effect for effect in hypothesis.added if effect not in replaced]
     walk = RateRandomWalk(K=initial_effect_size(hypothesis.axis))
-    fit = hypothesis.axis.fit((*known, *others, walk), hypothesis.fit.fixed_noise | slow)
+    fit = hypothesis.axis.fit((*known, *others, walk), hypothesis.fit.fixed_sizes | slow)
     jumps = fit_poisson_alternative(Hypothesis(hypothesis.model, fit))
     if jumps is None:
         return None

@@ -17,7 +17,7 @@ from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, PowerLaw, Sinusoidal
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects
-from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import find_maximum_by_golden_section, fit_deterministic_effects
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidate_effects import find_broad_spectral_peaks
@@ -152,7 +152,7 @@ def detect_sample_rate_error(
 
 
 def _log_likelihood(axis: Axis, effects: Effects) -> float:
-    return fit_with_fixed_noise(axis, effects).fit.log_likelihood
+    return fit_deterministic_effects(axis, effects).log_likelihood
 
 
 def _features(effects: Effects) -> list[Feature]:
@@ -195,7 +195,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
     found: list[tuple[float, float]] = []
     for name, axis in axes.items():
         if features[name]:
-            whitened = whiten_axis(fit_with_fixed_noise(axis, effects[name]).fit)
+            whitened = whiten_axis(fit_deterministic_effects(axis, effects[name]))
             power += _line_power(whitened, features[name], np.exp(-grid))
             found += _resonance_ratios(whitened, features[name])
     strongest = [at for at in np.argsort(power)[-MAX_TRIAL_RATIOS:] if power[at] > 0.0]

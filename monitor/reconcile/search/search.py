@@ -32,7 +32,7 @@ from monitor.reconcile.likelihood.effect_roles import effect_size, is_noise_effe
 from monitor.reconcile.likelihood.hypothesis_fit import (
     Hypothesis,
     fit_with_fewest_changes,
-    fit_with_fixed_noise,
+    fit_with_model_sizes,
     refit_correlation_times,
 )
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
@@ -131,7 +131,7 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
     rng : numpy.random.Generator
         Generator for the samples that replace outliers, repeats and clipped samples.
     """
-    current = _diagnose(fit_with_fixed_noise(axis, model))
+    current = _diagnose(fit_with_model_sizes(axis, model))
     rounds: list[SearchRound] = []
     while len(rounds) < MAX_ROUNDS:
         current, completed = _next_round(current, bool(rounds), null, rng)
@@ -222,7 +222,7 @@ def _with_finer_bins(current: _DiagnosedHypothesis) -> _DiagnosedHypothesis:
     if finer.count.size <= axis.bins.count.size + MIN_FINER_BINS:
         return current
     hypothesis = Hypothesis(
-        hypothesis.model, replace(axis, bins=finer).fit(hypothesis.effects, hypothesis.fit.fixed_noise)
+        hypothesis.model, replace(axis, bins=finer).fit(hypothesis.effects, hypothesis.fit.fixed_sizes)
     )
     axis.clear_cached_sums()
     return _DiagnosedHypothesis(hypothesis, whiten_axis(hypothesis.fit), current.findings)

@@ -47,7 +47,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     Hypothesis,
     find_maximum_by_golden_section,
     fit_with_fewest_changes,
-    noise_effect_indices,
+    indices_of_lasting_sizes,
     refit_correlation_times,
 )
 from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
@@ -516,10 +516,10 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
     """Return functions that compute the score of given effects with additional slow noise."""
     axis, small = hypothesis.axis, initial_effect_size(hypothesis.axis)
-    fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
+    fixed_sizes, cost = hypothesis.fit.fixed_sizes, hypothesis.resize_penalty
 
     def make_score_with_added_noise(noise: Effect) -> Callable[[Effects], float]:
-        return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
+        return lambda effects: axis.fit((*effects, noise), fixed_sizes).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
@@ -534,11 +534,12 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
 
     If the factor fits nearly as well as several changed sizes, it gets at least the score of these sizes.
     """
-    effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_effect_indices(hypothesis.model)
+    effects = (*hypothesis.model, *hypothesis.added)
+    fixed_sizes = indices_of_lasting_sizes(hypothesis.axis, hypothesis.model)
 
     def log_likelihood_with_axis_scale_factor(log_factor: float) -> float:
         return hypothesis.axis.fit(
-            (*effects, ScaleFactor(factor=float(np.exp(log_factor)))), fixed_noise
+            (*effects, ScaleFactor(factor=float(np.exp(log_factor)))), fixed_sizes
         ).log_likelihood
 
     start = float(max(np.linspace(-3.0, 3.0, 13), key=log_likelihood_with_axis_scale_factor))

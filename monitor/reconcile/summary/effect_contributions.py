@@ -44,6 +44,7 @@ from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
 from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.effect_roles import regression_coefficients
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import AllanInfluence, DiagnosticGap, RemainingGap
@@ -136,7 +137,7 @@ def fit_without(
     """
     effects: list[Effect] = []
     fixed: set[int] = set()
-    unchanged = hypothesis.fit.fixed_noise.difference(changed_sizes(hypothesis))
+    unchanged = hypothesis.fit.fixed_sizes.difference(changed_sizes(hypothesis))
     for at, effect in enumerate(hypothesis.effects):
         if at in removed and at >= hypothesis.model_effect_count:
             continue
@@ -264,12 +265,17 @@ def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterabl
     resized = changed_sizes(hypothesis)
     axis, effects = hypothesis.axis, hypothesis.effects
     factors = cluster_sizes(axis.n, axis.rate_hz)
-    deterministic = _deterministic_avars(hypothesis, factors)
+    places = {at: place for place, (at, _) in enumerate(hypothesis.fit.regressor_slices)}
+    deterministic = {
+        at: _deterministic_avar(hypothesis.fit, place, effects[at], factors) for at, place in places.items()
+    }
     total = _noise_avar(hypothesis, effects, factors) + sum(deterministic.values())
     found: dict[int, AllanInfluence] = {}
     for at in changed:
         if at in deterministic:
             without = total - deterministic[at]
+            if at in resized:
+                without += _deterministic_avar(hypothesis.fit, places[at], hypothesis.model[at], factors)
         else:
             old = (hypothesis.model[at],) if at in resized else ()
             rest = (*effects[:at], *old, *effects[at + 1 :])
@@ -297,13 +303,21 @@ def _noise_avar(hypothesis: Hypothesis, effects: Effects, factors: Ints) -> Floa
     return allan_variance_of_density(density, np.asarray(factors * tau0_s, np.float64), tau0_s, ())
 
 
-def _deterministic_avars(hypothesis: Hypothesis, factors: Ints) -> dict[int, Floats]:
-    """Return the Allan variance of each deterministic effect, by the index of the effect."""
-    axis, fit = hypothesis.axis, hypothesis.fit
-    found: dict[int, Floats] = {}
-    for at, place in fit.regressor_slices:
-        effect: Effect = hypothesis.effects[at]
-        columns = axis.regressor_cosine_transforms(effect)
-        series = sum(beta * column for beta, column in zip(fit.whittle.beta[place].tolist(), columns, strict=True))
-        found[at] = np.asarray(overlapping_avar_axis(inverse_cosine_transform(np.asarray(series)), factors)[0])
-    return found
+def _deterministic_avar(fit: AxisFit, place: int, effect: Effect, factors: Ints) -> Floats:
+    """Return the Allan variance of a deterministic effect, shape (m,).
+
+    Parameters
+    ----------
+    fit : AxisFit
+        Fit to the axis.
+    place : int
+        Index of the effect among the deterministic effects of the fit.
+    effect : Effect
+        Effect, which may have another size than in the fit.
+    factors : ndarray of int64, shape (m,)
+        Averaging times in samples.
+    """
+    coefficients = fit.regressor_gains[place] * regression_coefficients(effect)
+    columns = fit.axis.regressor_cosine_transforms(effect)
+    series = sum(beta * column for beta, column in zip(coefficients.tolist(), columns, strict=True))
+    return np.asarray(overlapping_avar_axis(inverse_cosine_transform(np.asarray(series)), factors)[0])

@@ -18,7 +18,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import BandwidthLimit, Narrowband, Sinusoidal
-from monitor.reconcile.effect_properties import NOISE_SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AllanInfluence,
@@ -38,7 +38,7 @@ PEAK_NAMES: Final = ("sinusoidal", "narrowband", "wandering_line")
 """Effects that one oscillation produces on different axes."""
 MAX_LOG_RATIO_DIFFERENCE: Final = log(1.1)
 """Largest difference between the logarithms of two size ratios in the same finding."""
-_SIZE_NAMES: Final = NOISE_SIZE_PARAMETERS | {"scale_factor": "factor", "resolution": "step"}
+_SIZE_NAMES: Final = SIZE_PARAMETERS | {"scale_factor": "factor", "resolution": "step"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,9 @@ def _factors_agree(axis: str, ratio: float, other_axis: str, other_ratio: float,
 
     Only axes of one triad have a common factor. A moved effect whose size is unchanged is common to both triads.
     """
-    unchanged = both_moved and abs(log(ratio)) <= MAX_LOG_RATIO_DIFFERENCE
+    if ratio * other_ratio < 0.0:
+        return False
+    unchanged = both_moved and abs(log(abs(ratio))) <= MAX_LOG_RATIO_DIFFERENCE
     return (axis[0] == other_axis[0] or unchanged) and abs(log(ratio / other_ratio)) <= MAX_LOG_RATIO_DIFFERENCE
 
 
@@ -160,7 +162,7 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
     """Return the ratio of the new size to the old size, or None for an added effect or an unknown size."""
     name = _SIZE_NAMES.get(step.effect)
     now = step.parameters.get(name) if name is not None else None
-    if name is None or now is None or isinstance(now.value, str) or not now.value > 0.0:
+    if name is None or now is None or isinstance(now.value, str) or not now.value:
         return None
     if step.effect == "scale_factor":
         return now.value

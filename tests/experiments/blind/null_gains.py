@@ -37,7 +37,7 @@ from monitor.reconcile.diagnostics.null_distribution import (  # noqa: E402
 )
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS  # noqa: E402
 from monitor.reconcile.likelihood.axis_fit import RegressorCache  # noqa: E402
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise  # noqa: E402
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_model_sizes  # noqa: E402
 from monitor.reconcile.likelihood.whitening import whiten_axis  # noqa: E402
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes  # noqa: E402
 from monitor.reconcile.reconcile import SIMULATED_RECORDINGS  # noqa: E402
@@ -70,7 +70,7 @@ def diagnose(model: NoiseModel, n: int, seeds: Sequence[int]) -> Round:
         recording = RecordedAxes({axis: drawn[:, AXES.index(axis)] for axis in effects}, RATE_HZ, temperature_c)
         axes = build_repaired_axes(recording, effects, regressors, np.random.default_rng(seed))
         for axis, own in effects.items():
-            found[axis].append(run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[axis], own).fit)))
+            found[axis].append(run_diagnostics(whiten_axis(fit_with_model_sizes(axes[axis], own).fit)))
     return found
 
 

@@ -14,7 +14,7 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import DIAGNOSTICS
 from monitor.reconcile.likelihood.axis_fit import Axis, RegressorCache
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_deterministic_effects
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.search.sample_repair import build_repaired_axes
@@ -83,7 +83,7 @@ def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | No
 
 def whiten(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
     """Whiten an axis by a model without fitting its parameters."""
-    return whiten_axis(fit_with_fixed_noise(one, effects).fit)
+    return whiten_axis(fit_deterministic_effects(one, effects))
 
 
 def recording(

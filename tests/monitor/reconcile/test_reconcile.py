@@ -32,6 +32,7 @@ from monitor.reconcile.preparation.reconcile_input import (
 )
 from monitor.reconcile.reconcile import RecordingContext, _effects_by_axis, fit_five_terms, reconcile
 from monitor.reconcile.result import combine_decisions
+from monitor.reconcile.summary.ranked_findings import rank_findings
 from tests.monitor.reconcile.axes import (
     GYRO_AXES,
     MODEL,
@@ -248,6 +249,59 @@ def test_constant_bias_is_no_part_of_the_comparison():
     model = MODEL + NoiseModel({"gz": (ConstantBias(value=0.3),)})
     assert _effects_by_axis(model, draw_recording())["gz"] == TERMS
     assert _effects_by_axis(NoiseModel({}), draw_recording()) == dict.fromkeys(GYRO_AXES, ())
+
+
+WHITE_AX = AngleRandomWalk(N=10.0 * N)
+WITH_SIZES = NoiseModel(
+    {
+        "gx": (WHITE, TemperatureBias(coefficient=4e-5, reference=25.0)),
+        "gy": (WHITE, Sinusoidal(amplitude=3e-4, frequency=7.3)),
+        "gz": (WHITE, CrossAxis(source="gy", coefficient=0.02)),
+        "ax": (WHITE_AX, RateRamp(R=1e-5)),
+    }
+)
+
+
+def recording_with_sizes(factors):
+    """Draw a recording of ``WITH_SIZES`` in plain NumPy, with each deterministic effect multiplied by a factor."""
+    rng = np.random.default_rng(7)
+    t, warm = time_s(n), make_changing_temperature(n)
+    gy = white(n, rng) + factors["gy"] * 3e-4 * np.sin(2.0 * np.pi * 7.3 * t + 1.0)
+    values = {
+        "gx": white(n, rng) + factors["gx"] * 4e-5 * (warm - 25.0),
+        "gy": gy,
+        "gz": white(n, rng) + factors["gz"] * 0.02 * gy,
+        "ax": white(n, rng, WHITE_AX.N) - factors["ax"] * 1e-5 * t,
+    }
+    return RecordedAxes(values, RATE_HZ, warm)
+
+
+def test_sizes_of_deterministic_effects_agree():
+    assert reconcile(recording_with_sizes(dict.fromkeys(WITH_SIZES.effects, 1.0)), WITH_SIZES, 1).verdict == "agrees"
+
+
+def test_changed_sizes_of_deterministic_effects_are_retuned():
+    factors = {"gx": 1.5, "gy": 0.6, "gz": 5.0, "ax": 2.0}
+    found = reconcile(recording_with_sizes(factors), WITH_SIZES, 1)
+    assert found.verdict == "explained"
+    for axis, factor in factors.items():
+        effect = WITH_SIZES.effects[axis][1]
+        (step,) = found.axes[axis].steps
+        assert (step.kind, step.effect) == ("retuned", effect.name)
+        assert step.confidence > 0.9
+        (size,) = step.parameters.keys() & {"coefficient", "amplitude", "R"}
+        bounds = step.parameters[size]
+        half = bounds.hi - bounds.value
+        assert bounds.value == pytest.approx(factor * getattr(effect, size), abs=2.0 * half)
+        assert half < 0.2 * bounds.value
+        assert getattr(found.model.effects[axis][1], size) == bounds.value
+    ratios = {one.axes: one.size_ratio for one in rank_findings(found).findings}
+    assert ratios == {(axis,): pytest.approx(factor, rel=0.2) for axis, factor in factors.items()}
+
+
+def test_missing_line_of_the_model_is_absent():
+    found = reconcile(recording_with_sizes({"gx": 1.0, "gy": 0.0, "gz": 1.0, "ax": 1.0}), WITH_SIZES, 1)
+    assert [(step.kind, step.effect) for step in found.axes["gy"].steps] == [("absent", "sinusoidal")]
 
 
 def test_temperature_is_smoothed_and_gaps_are_filled():

@@ -24,7 +24,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.axis_fit import RegressorCache
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_model_sizes
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins, cosine_transform
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
@@ -61,7 +61,7 @@ def test_spectrum_equals_that_of_the_model(name):
     effects = COMPANY[name]
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 3)[:, 2].copy()
     one = axis(y, effects)
-    found = fit_with_fixed_noise(one, effects)
+    found = fit_with_model_sizes(one, effects)
     expected = NoiseModel({"gz": effects}).two_sided_psd("gz", one.bins.f_hz, 1.0 / RATE_HZ)
     # a little white noise behind a filter is fitted too
     np.testing.assert_allclose(found.fit.whittle.variance / RATE_HZ, expected, rtol=0.02, atol=3e-5 * expected.max())
@@ -82,6 +82,41 @@ def test_sizes_are_estimated_with_their_errors():
     # 40 standardised errors scatter by 11 %, their mean by 16 %
     assert np.std(off, axis=0) == pytest.approx(1.0, abs=0.35)
     assert np.abs(np.mean(off, axis=0)).max() < 0.55
+
+
+@pytest.mark.parametrize("chain", [(BandwidthLimit(cutoff=10.0, order=2),), (ScaleFactor(factor=1.4),)])
+def test_amplitude_of_a_line_is_that_before_filter_and_scale_factor(chain):
+    line = Sinusoidal(amplitude=1e-3, frequency=12.0)
+    y = NoiseModel({"gz": (WHITE, line, *chain)}).simulate(n, RATE_HZ, 3)[:, 2].copy()
+    found = axis(y, (WHITE, *chain)).fit((WHITE, Sinusoidal(amplitude=1.0, frequency=12.0), *chain))
+    assert found.effects[1].amplitude == pytest.approx(1e-3, abs=4.0 * found.size_standard_error(1))
+    assert found.size_standard_error(1) < 2e-5
+
+
+def test_fixed_sizes_of_deterministic_effects_are_kept():
+    rng = np.random.default_rng(1)
+    t, warm = time_s(n), make_temperature(n)
+    y = white(n, rng) + 2e-4 * np.sin(2.0 * np.pi * 7.3 * t + 0.8) + 1e-4 * (warm - 25.0) - 2e-6 * t
+    effects = (
+        WHITE,
+        Sinusoidal(amplitude=3e-4, frequency=7.3),
+        TemperatureBias(coefficient=1.5e-4, quadratic=1e-6, reference=25.0),
+        RateRamp(R=3e-6),
+    )
+    one = axis(y, temperature_c=warm)
+    free, fixed = one.fit(effects), one.fit(effects, frozenset({1, 2, 3}))
+    assert fixed.effects[1].amplitude == 3e-4
+    assert fixed.effects[1].phase == pytest.approx(0.8, abs=0.05)
+    assert fixed.effects[2:] == effects[2:]
+    assert fixed.whittle.beta[-1] == -3e-6
+    # the white noise of the fixed fit contains the remainder of all three effects
+    rest = y + 3e-6 * t - 3e-4 * np.sin(2.0 * np.pi * 7.3 * t + fixed.effects[1].phase)
+    rest -= 1.5e-4 * (warm - 25.0) + 1e-6 * (warm - 25.0) ** 2
+    assert fixed.whittle.residual.sum() == pytest.approx(np.sum((rest - rest.mean()) ** 2), rel=1e-3)
+    assert fixed.log_likelihood < free.log_likelihood - 50.0
+    only_line = one.fit(effects, frozenset({1}))
+    assert only_line.effects[2].coefficient == pytest.approx(1e-4, abs=4.0 * only_line.size_standard_error(2))
+    assert only_line.size_standard_error(1) == 0.0
 
 
 def test_regressors_and_noise_are_fitted_together():

@@ -22,7 +22,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     compute_size_interval,
     fit_shape_parameter,
     fit_with_fewest_changes,
-    fit_with_fixed_noise,
+    fit_with_model_sizes,
     with_shape,
 )
 from monitor.reconcile.likelihood.whitening import whiten_axis
@@ -55,7 +55,7 @@ def test_true_model_is_not_changed():
         one = axis(draw_axis(seed))
         state = fit_with_fewest_changes(one, (), MODEL)
         resized_model_effect_count += state.resized_model_effect_count
-        assert fit_with_fixed_noise(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
+        assert fit_with_model_sizes(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
     assert resized_model_effect_count <= 1  # another size that gains this much: once in some hundred
 
 
@@ -69,7 +69,7 @@ def test_wrong_size_is_changed_and_the_right_one_stays(wrong, at):
     assert state.effects[1 - at] == given[1 - at]
     found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
     assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
-    assert state.penalised_log_likelihood > fit_with_fixed_noise(one, given).penalised_log_likelihood
+    assert state.penalised_log_likelihood > fit_with_model_sizes(one, given).penalised_log_likelihood
 
 
 def test_both_wrong_sizes_are_found():
@@ -152,7 +152,7 @@ def test_intervals_of_a_step_contain_its_time():
         rng = np.random.default_rng([1, seed])
         time = rng.uniform(0.2, 0.8) * n / RATE_HZ
         one = axis(white(n, rng) + 4e-4 * (time_s(n) >= time))
-        gains, times_s, _ = compute_level_step_gains(whiten_axis(fit_with_fixed_noise(one, (WHITE,)).fit))
+        gains, times_s, _ = compute_level_step_gains(whiten_axis(fit_with_model_sizes(one, (WHITE,)).fit))
         step = BiasStep(time=float(times_s[int(np.argmax(gains))]), height=1.0)
         found = compute_shape_interval(fit_with_fewest_changes(one, (step,), (WHITE,)).fit, 1, "time")
         inside.append(found.lo <= time <= found.hi)
@@ -184,7 +184,7 @@ def test_interval_of_an_insignificant_size_begins_at_zero(size):
 
 def test_fixed_or_zero_size_has_no_interval():
     one = axis(white(n, np.random.default_rng(0)))
-    held = compute_size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
+    held = compute_size_interval(fit_with_model_sizes(one, (WHITE, WALK)).fit, 0)
     assert (held.value, held.lo, held.hi) == (N, None, None)
     for seed in range(8):  # K is at its bound in about half of the cases
         state = fit_with_fewest_changes(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())

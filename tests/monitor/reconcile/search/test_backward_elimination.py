@@ -18,7 +18,7 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.null_distribution import run_diagnostics
 from monitor.reconcile.likelihood.effect_roles import effect_size
-from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fewest_changes, fit_with_model_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.search.backward_elimination import (
     changed_sizes,
@@ -163,7 +163,7 @@ def test_weak_line_stays_if_another_axis_has_it():
     both = axes({"gx": loud, "gz": y}, MODEL)
     found = {name: make_found(fit_with_fewest_changes(one, (line,), MODEL)) for name, one in both.items()}
     null = dict.fromkeys(found, STRICT)
-    gain = found["gz"].hypothesis.fit.log_likelihood - fit_with_fixed_noise(both["gz"], MODEL).fit.log_likelihood
+    gain = found["gz"].hypothesis.fit.log_likelihood - fit_with_model_sizes(both["gz"], MODEL).fit.log_likelihood
     assert 5.0 < gain < 23.0
     together = eliminate_unneeded_effects(found, null, fitted_first=False)
     alone = eliminate_unneeded_effects({"gz": found["gz"]}, null, fitted_first=False)

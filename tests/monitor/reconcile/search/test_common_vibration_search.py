@@ -7,7 +7,7 @@ import pytest
 
 from monitor.noise.effects import CommonVibration, CrossAxis
 from monitor.reconcile.diagnostics.whiteness_tests import diagnose_leaks_from_other_axes
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_model_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.search.common_vibration_search import (
     _cross_spectra_of_halves,
@@ -138,8 +138,8 @@ def test_leak_beside_a_known_vibration_is_found(leak):
         for name in values
     }
     one = axes(values, effects)["gx"]
-    gain = diagnose_leaks_from_other_axes(whiten_axis(fit_with_fixed_noise(one, effects["gx"]).fit)).gain
-    alone = diagnose_leaks_from_other_axes(whiten_axis(fit_with_fixed_noise(one, (WHITE,)).fit)).gain
+    gain = diagnose_leaks_from_other_axes(whiten_axis(fit_with_model_sizes(one, effects["gx"]).fit)).gain
+    alone = diagnose_leaks_from_other_axes(whiten_axis(fit_with_model_sizes(one, (WHITE,)).fit)).gain
     assert alone > 100.0
     assert (gain > 50.0) == (leak > 0.0)
     assert leak or gain < 8.0
@@ -151,7 +151,7 @@ def test_axis_belongs_to_a_vibration_with_evidence_in_both_halves(shared):
     values = add_vibration(unit, 3, ("gx", "gy"))
     part = {"whole": n, "first half": n // 2, "not at all": 0}[shared]
     values["gz"] = values["gz"] + np.where(np.arange(n) < part, GAINS["gz"] * unit, 0.0)
-    hypotheses = [fit_with_fixed_noise(one, MODEL) for one in axes(values, MODEL).values()]
+    hypotheses = [fit_with_model_sizes(one, MODEL) for one in axes(values, MODEL).values()]
     whitened = [whiten_axis(one.fit) for one in hypotheses]
     spectra = build_cross_spectra(whitened, [shape])
     vibration = _Vibration(shape, np.array(list(GAINS.values())), 0.0)
@@ -165,6 +165,6 @@ def test_product_of_large_coefficients_is_limited_by_the_power_of_the_bin():
     cosine = np.cos(np.pi * (k + 0.5) * at / n) * np.sqrt(2.0 / n)  # one row of the cosine transform
     size = {"gx": 30.0, "gy": 66.0, "gz": 0.0}
     values = {name: y + size[name] * N * 10.0 * cosine for name, y in draw_noise(3).items()}
-    whitened = [whiten_axis(fit_with_fixed_noise(one, MODEL).fit) for one in axes(values, MODEL).values()]
+    whitened = [whiten_axis(fit_with_model_sizes(one, MODEL).fit) for one in axes(values, MODEL).values()]
     spectra = build_cross_spectra(whitened, [(0.5 * 100.0 * at / n, 0.01)])
     assert (np.abs(spectra.products[0, 1]) <= spectra.bins.count * (1.0 + 1e-9)).all()

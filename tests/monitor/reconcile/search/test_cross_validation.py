@@ -18,7 +18,7 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.diagnostics.whiteness_tests import find_peak_gains_and_frequencies
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_model_sizes
 from monitor.reconcile.search.cross_validation import cross_validate
 from monitor.reconcile.search.sample_repair import repair_axis_again
 from tests.monitor.reconcile.axes import (
@@ -48,7 +48,7 @@ def draw_noise(seed=0):
 
 
 def validate_step(one, effect, diagnostic, model=MODEL):
-    before, after = fit_with_fixed_noise(one, model), fit_with_fewest_changes(one, (effect,), model)
+    before, after = fit_with_model_sizes(one, model), fit_with_fewest_changes(one, (effect,), model)
     return cross_validate(before, after, after.effects[-1], diagnostic, NULL)
 
 
@@ -107,7 +107,7 @@ def test_effect_that_one_half_contradicts_is_not_kept(name):
     hidden, effect, diagnostic = BY_CHANCE[name]
     hidden = hidden * HALF if diagnostic == "psd" else hidden
     one = axes({"gx": OTHER, "gz": draw_noise() + hidden}, {"gx": (), "gz": MODEL}, make_temperature(n))["gz"]
-    before, after = fit_with_fixed_noise(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
+    before, after = fit_with_model_sizes(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
     assert after.fit.log_likelihood - before.fit.log_likelihood > 20.0
     found = cross_validate(before, after, effect, diagnostic, NULL)
@@ -128,7 +128,7 @@ def test_strongest_line_of_noise_is_not_validated():
 
 def test_changed_size_of_a_known_noise_is_kept():
     one = axis(1.2 * draw_noise(5))
-    before = fit_with_fixed_noise(one, MODEL)
+    before = fit_with_model_sizes(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
     assert after.resized_model_effect_count >= 1
     found = cross_validate(before, after, None, "psd", NULL)

@@ -24,7 +24,7 @@ from monitor.noise.effects import (
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.axis_result_builder import build_axis_result
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_model_sizes
 from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_missing_effects
 from monitor.reconcile.search.trials import generate_trial_groups
 from tests.monitor.reconcile.axes import (
@@ -291,7 +291,7 @@ def test_candidates_on_a_true_model_do_not_reach_their_penalty():
         one = axis(draw_noise(20 + seed), MODEL)
         trials = [
             each
-            for kind in generate_trial_groups(fit_with_fixed_noise(one, MODEL), whiten(one, MODEL))
+            for kind in generate_trial_groups(fit_with_model_sizes(one, MODEL), whiten(one, MODEL))
             for each in kind
         ]
         assert trials
@@ -390,7 +390,7 @@ def test_filter_that_changes_in_two_rounds_is_one_step_with_the_whole_gain():
     found = search_missing_effects(one, model, STRICT, np.random.default_rng(0))
     steps = build_axis_result(found, STRICT, STRICT).steps
     assert [step.effect for step in steps].count("bandwidth_limit") == 1
-    gain = found.hypothesis.fit.log_likelihood - fit_with_fixed_noise(one, model).fit.log_likelihood
+    gain = found.hypothesis.fit.log_likelihood - fit_with_model_sizes(one, model).fit.log_likelihood
     assert sum(step.gain_nats for step in steps) == pytest.approx(gain, rel=0.01)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monitor.noise.effects import Outliers
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import fit_with_model_sizes
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.search.trials import _outlier_trial
 from tests.monitor.reconcile.axes import WHITE, axis, white
@@ -19,7 +19,7 @@ n = 36_000
 def test_distant_outliers_are_named_if_the_misfit_is_much_smaller_than_their_gain(misfit_share, named):
     rng = np.random.default_rng(2)
     outliers = 5.0 * (rng.random(n) < 5e-3) * white(n, rng)
-    hypothesis = fit_with_fixed_noise(axis(white(n, rng) + outliers, (WHITE,)), (WHITE,))
+    hypothesis = fit_with_model_sizes(axis(white(n, rng) + outliers, (WHITE,)), (WHITE,))
     fit = whiten_axis(hypothesis.fit).outlier_fit
     found = replace(fit, misfit_z=(2.0 * misfit_share * fit.gain) ** 0.5, clustering_z=0.0)
     trials = _outlier_trial(hypothesis, SimpleNamespace(outlier_fit=found, effect_types=frozenset()))

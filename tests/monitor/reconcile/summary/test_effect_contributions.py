@@ -18,7 +18,7 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.likelihood.effect_roles import with_effect_size
-from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fixed_noise
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_model_sizes
 from monitor.reconcile.result import DiagnosticGap, Location
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.cross_validation import accept_without_validation
@@ -59,7 +59,7 @@ def test_parts_are_not_negative_and_complete():
     hypothesis = louder_with_line()
     gains = decompose_explained_gain(search(hypothesis), fitted_first=False)
     assert set(gains) == {0, 2, 3}
-    start = fit_with_fixed_noise(hypothesis.axis, MODEL).fit.log_likelihood
+    start = fit_with_model_sizes(hypothesis.axis, MODEL).fit.log_likelihood
     assert sum(gains.values()) == pytest.approx(hypothesis.fit.log_likelihood - start, abs=1e-3)
     assert gains[2] == pytest.approx(1.5e-4**2 * n / (4 * (1.2 * N) ** 2 * 100.0), rel=0.15)  # A²n/(4σ²)
     assert gains[0] == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
@@ -158,7 +158,7 @@ def test_diagnostics_of_one_group_count_once():
 
 def test_spectrum_that_is_wrong_everywhere_counts_in_every_band():
     rng = np.random.default_rng(3)
-    wrong = fit_with_fixed_noise(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
+    wrong = fit_with_model_sizes(axis(1.2 * (white(n, rng) + walk(n, rng)), MODEL), MODEL)
     (one,) = measure_remaining_gaps(search(wrong), (make_gap("psd", 60.0),))
     assert one.gain_nats == pytest.approx(0.5 * n * (1.2**2 - 1.0 - 2 * np.log(1.2)), rel=0.15)
 
