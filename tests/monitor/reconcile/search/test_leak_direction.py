@@ -1,26 +1,60 @@
-"""Tests of the direction of leaks, with axes whose noise has different spectra, and with leaks in the model."""
-
-from math import log
+"""Tests of the direction of leaks between axes with equal or different spectra, drawn in plain NumPy."""
 
 import numpy as np
 import pytest
 
 from monitor.noise.effects import CrossAxis
-from monitor.reconcile.diagnostics.null_distribution import AxisNull
-from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes
-from monitor.reconcile.search.leak_direction import (
-    _describe_leak,
-    add_opposite_leaks_as_alternatives,
-    find_leaks_in_wrong_direction,
-)
-from monitor.reconcile.search.search import AxisSearchResult, search_missing_effects
-from tests.monitor.reconcile.axes import MODEL, RATE_HZ, TERMS, WALK, WHITE, axes, make_null, white
+from monitor.noise.model import NoiseModel
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
+from monitor.reconcile.reconcile import reconcile
+from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, walk, white
 
 n = 20_000
+WHITE_AXES = NoiseModel({"gx": (WHITE,), "gy": (WHITE,)})
+DIFFERENT_AXES = NoiseModel({"gx": (WHITE,), "gy": (WHITE, WALK)})
 
 
-def search_both_axes(values, effects, seed=0) -> tuple[dict[str, AxisSearchResult], dict[str, AxisNull]]:
-    prepared = axes(values, effects)
-    null = {name: make_null(n) for name in values}
+def reconcile_leak(model, coefficient, seed):
+    """Compare a recording in which gy leaks into gx with a model."""
     rng = np.random.default_rng(seed)
-    return {name: search_missing_effects(one, effects[name], null[name], rng) for name, one in prepared.items()}, null
+    gy = white(n, rng)
+    if WALK in model.effects["gy"]:
+        gy += walk(n, rng)
+    return reconcile(RecordedAxes({"gx": white(n, rng) + coefficient * gy, "gy": gy}, RATE_HZ, None), model, seed)
+
+
+def list_steps(found):
+    return [(axis, step.kind, step.effect) for axis, one in found.axes.items() for step in one.steps]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_leak_between_axes_with_different_spectra_has_one_direction(seed):
+    found = reconcile_leak(DIFFERENT_AXES, 0.3, seed)
+    assert list_steps(found) == [("gx", "added", "cross_axis")]
+    assert found.axes["gx"].steps[0].confidence > 0.99
+
+
+def test_direction_of_a_weak_leak_between_equal_axes_is_uncertain():
+    confidences = []
+    for seed in range(4):
+        found = reconcile_leak(WHITE_AXES, 0.05, seed)
+        ((_, kind, effect),) = list_steps(found)
+        assert (kind, effect) == ("added", "cross_axis")
+        confidences += [step.confidence for one in found.axes.values() for step in one.steps]
+    assert np.mean(confidences) == pytest.approx(0.6, abs=0.2)
+
+
+@pytest.mark.parametrize("model_coefficient", [0.02, -0.1])
+def test_other_coefficient_of_a_leak_of_the_model_adds_no_leak_in_the_opposite_direction(model_coefficient):
+    leak = CrossAxis(source="gy", coefficient=model_coefficient)
+    found = reconcile_leak(WHITE_AXES + NoiseModel({"gx": (leak,)}), 0.1, 1)
+    assert list_steps(found) == [("gx", "retuned", "cross_axis")]
+
+
+def test_leak_of_the_model_is_no_leak_in_the_opposite_direction():
+    """The search on gy starts because of its white noise, and finds the samples of gx correlated with gy."""
+    leak = CrossAxis(source="gy", coefficient=0.05)
+    model = NoiseModel({"gx": (WHITE, leak), "gy": (WALK,)})
+    found = reconcile_leak(model, 0.05, 1)
+    assert ("gy", "added", "cross_axis") not in list_steps(found)
+    assert found.axes["gy"].steps
