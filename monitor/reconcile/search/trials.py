@@ -408,7 +408,7 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
     ]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found += _moved_feature_trials(hypothesis, found)
-    found += _changed_low_pass_trials(hypothesis)
+    found += _low_pass_trials_beside_known_filter(hypothesis)
     if not hypothesis.axis.is_model_fitted:
         found.append(_scale_factor_trial(hypothesis, resized))
     found = _best_first(found)
@@ -442,13 +442,13 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
     return found
 
 
-def _changed_low_pass_trials(hypothesis: Hypothesis) -> list[Trial]:
-    """Try another cutoff, kind and order of a low-pass filter of the model.
+def _low_pass_trials_beside_known_filter(hypothesis: Hypothesis) -> list[Trial]:
+    """Try another cutoff, kind and order of a low-pass filter of the model, and a second filter.
 
-    A filter changes if the sensor has another bandwidth setting.
+    A filter changes if the sensor has another bandwidth setting. The host computer may add a second filter.
     """
     places = [at for at, known in enumerate(hypothesis.model) if isinstance(known, BandwidthLimit)]
-    if len(places) != 1:
+    if len(places) != 1 or any(isinstance(effect, BandwidthLimit) for effect in hypothesis.added):
         return []
     (at,) = places
     known = hypothesis.model[at]
@@ -460,7 +460,9 @@ def _changed_low_pass_trials(hypothesis: Hypothesis) -> list[Trial]:
     model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
     changed = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
     gain = changed.penalised_log_likelihood - hypothesis.penalised_log_likelihood
-    return [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at, replaced=known)]
+    found = [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at, replaced=known)]
+    second = fit_low_pass(hypothesis.axis, hypothesis.effects)
+    return found if second is None else [*found, _noise_trial(hypothesis, second)]
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:

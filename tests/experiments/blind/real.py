@@ -304,8 +304,11 @@ def run_sensor(data: Path, sensor: Sensor, seed: int, only: Sequence[str]) -> li
             named = right
             if name == "scale_factor" and only_noise is not None:
                 right = right or (sensor.hidden_axis, only_noise) in answer.resized
-            if name == "bandwidth_limit":  # a filter after a filter of the model is one filter with another cutoff
-                right = right or (sensor.hidden_axis, name) in answer.resized
+            if name in (
+                "bandwidth_limit",
+                "leak",
+            ):  # beside a filter or leak of the model, the sum has other parameters
+                right = right or (sensor.hidden_axis, expected) in answer.resized
             text = _format_row(sensor.name, name, _format_sizes(parameters), answer.verdict, added, answer.seconds)
             print(text, flush=True)
             found.append((text, right, len(added) - named))
