@@ -3,7 +3,7 @@
 Each function returns the detected artifact, or None. The evidence is the log-likelihood gain, in nats, over a series
 without the artifact.
 
-A quantization step can be much smaller than the noise. A step of the number format, such as float32 or decimal text, is
+A quantization step can be a hundredth of the noise. A step of the number format, such as float32 or decimal text, is
 reported only if the step is at least a tenth of the noise. Repeated samples cannot be detected if the step exceeds the
 noise. Clipping cannot be detected if the step exceeds two standard deviations.
 """
@@ -31,6 +31,8 @@ MIN_STEP_TO_ROUNDING: Final = 25.0
 """Smallest detectable step, as a multiple of the rounding of the values."""
 MIN_STEP_TO_NOISE: Final = 0.1
 """Smallest ratio of step to noise at which a step of the number format is reported."""
+MIN_INFLUENTIAL_STEP_TO_NOISE: Final = 0.01
+"""Smallest ratio of step to noise at which a grid is an artifact. Smaller steps add less than 10⁻⁵ of the variance."""
 MIN_NOISE_TO_STEP_CLIPPING: Final = 0.5
 """Smallest ratio of noise to step at which clipping is tested.
 """
@@ -99,7 +101,14 @@ class ValueArtifacts:
 
     @cached_property
     def quantization(self) -> QuantizationGrid | None:
-        """Quantization grid, or None if no grid is detected."""
+        """Quantization grid, or None if no grid is detected or its step is much smaller than the noise."""
+        grid = self._grid
+        if grid is None or grid.step.value < MIN_INFLUENTIAL_STEP_TO_NOISE * _sample_noise(_finite_values(self._y)):
+            return None
+        return grid
+
+    @cached_property
+    def _grid(self) -> QuantizationGrid | None:
         return detect_quantization(self._y)
 
     @cached_property
@@ -115,7 +124,7 @@ class ValueArtifacts:
 
     @property
     def _step(self) -> float:
-        return self.quantization.step.value if self.quantization else 0.0
+        return self._grid.step.value if self._grid else 0.0
 
 
 def detect_quantization(y: Floats) -> QuantizationGrid | None:

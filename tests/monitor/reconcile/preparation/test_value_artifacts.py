@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.value_artifacts import detect_clipping, detect_quantization, detect_repeats
+from monitor.reconcile.preparation.value_artifacts import (
+    ValueArtifacts,
+    detect_clipping,
+    detect_quantization,
+    detect_repeats,
+)
 
 N = 30_000
 DEGREE = np.pi / 180.0
@@ -194,3 +199,13 @@ def test_other_signals_have_no_repeats(x, step):
 def test_repeats_on_an_unknown_grid_are_not_known():
     found = detect_repeats(0.05 * np.rint(draw_noise() / 0.05))
     assert found is None or (found.gain < 8.0 and not found.mask.any())
+
+
+def test_grid_much_finer_than_the_noise_is_no_artifact():
+    step = 0.0051373
+    y = step * np.rint(np.random.default_rng(3).standard_normal(100_000) / step)
+    assert detect_quantization(y).step.value == pytest.approx(step, rel=1e-6)
+    found = ValueArtifacts(y)
+    assert found.quantization is None
+    assert found.repeats.gain < 1.0 < detect_repeats(y).gain  # equal values are expected on this grid
+    assert ValueArtifacts(3.0 * step * np.rint(y / (3.0 * step))).quantization is not None
