@@ -115,7 +115,7 @@ def fit_with_model_sizes(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    model = _with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
+    model = with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
     return Hypothesis(model, axis.fit(model, indices_of_lasting_sizes(axis, model)))
 
 
@@ -129,7 +129,7 @@ def fit_deterministic_effects(axis: Axis, model: Effects) -> AxisFit:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    model = _with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
+    model = with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
     return axis.fit(model, noise_effect_indices(model))
 
 
@@ -159,12 +159,19 @@ def _with_fitted_timing(axis: Axis, model: Effects) -> Effects:
     return tuple(fit_timing(effect) for effect in model)
 
 
-def _with_fitted_mean_variance(axis: Axis, model: Effects) -> Effects:
+def with_fitted_mean_variance(axis: Axis, model: Effects) -> Effects:
     """Return the effects with the angle random walk of this recording, if the variance varies randomly.
 
     The logarithm of the variance has the standard deviation s and the correlation time T. Over a long recording, the
     mean of the logarithm has the standard deviation s √(2T/length). The change is at most ``MAX_MEAN_DEVIATIONS`` times
     this value.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis to fit.
+    model : tuple of Effect
+        Effects of the axis.
     """
     spread = max(
         (

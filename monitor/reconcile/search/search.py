@@ -22,6 +22,7 @@ from monitor.noise.effects import (
     RateRandomWalk,
     Saturation,
     WanderingLine,
+    WanderingVariance,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
@@ -34,6 +35,7 @@ from monitor.reconcile.likelihood.hypothesis_fit import (
     fit_with_fewest_changes,
     fit_with_model_sizes,
     refit_correlation_times,
+    with_fitted_mean_variance,
 )
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.cosine_bins import build_frequency_bins
@@ -280,8 +282,11 @@ def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) 
     axis = hypothesis.axis
     if type(trial.effect) in REPAIRED_EFFECTS:
         axis = repair_axis_again(axis, (*hypothesis.model, *added), rng)
-    added = refit_correlation_times(axis, added, hypothesis.model)
-    return drop_unneeded_effects(fit_with_fewest_changes(axis, added, hypothesis.model))
+    model = hypothesis.model
+    if isinstance(trial.effect, WanderingVariance):  # the mean variance of the recording depends on chance
+        model = with_fitted_mean_variance(axis, (*model, trial.effect))[: len(model)]
+    added = refit_correlation_times(axis, added, model)
+    return drop_unneeded_effects(fit_with_fewest_changes(axis, added, model))
 
 
 def _is_gaussian_and_stationary(whitened: WhitenedAxis, null: AxisNull) -> bool:

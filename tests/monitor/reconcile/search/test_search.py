@@ -25,6 +25,7 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.axis_result_builder import build_axis_result
 from monitor.reconcile.likelihood.effect_roles import build_unit_regressors
 from monitor.reconcile.likelihood.hypothesis_fit import fit_with_fewest_changes, fit_with_model_sizes
+from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_missing_effects
 from monitor.reconcile.search.trials import generate_trial_groups
 from tests.monitor.reconcile.axes import (
@@ -150,6 +151,8 @@ def test_random_noise_level_is_a_wandering_variance(seed):
     effect = found.hypothesis.effects[-1]
     assert effect.deviation == pytest.approx(hidden.deviation, rel=0.3)
     assert max(one.gain for one in found.final.findings.values()) < 20.0
+    # the mean variance of a recording depends on chance and is no other size of the model
+    assert changed_sizes(found.hypothesis) == []
 
 
 @pytest.mark.parametrize("seed", range(4))
