@@ -71,7 +71,7 @@ def _findings_table(r: Reconciliation) -> RenderableType:
     rows.add_column("Allan deviation", overflow="fold")
     ranking = rank_findings(r)
     for one in ranking.findings:
-        said = Text(describe_finding(one) if one.kind == "absent" else f"{one.kind} {describe_finding(one)}")
+        said = Text(f"added {describe_finding(one)}" if one.kind == "added" else describe_finding(one))
         sure = words.format_probability(one.confidence)
         rows.add_row(format_share(one.share), said, sure, words.describe_allan_influence(one))
     for left in ranking.remainders:

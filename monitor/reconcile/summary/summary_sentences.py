@@ -157,7 +157,8 @@ def describe_finding(finding: RankedGapCause) -> str:
         details.append(shape.format(**numbers))
         has_new_shape = True
     if finding.kind == "retuned" and not (has_new_shape and _is_nearly_one(finding.size_ratio)):
-        details.append(f"times {finding.size_ratio:.3g}" if finding.size_ratio else "of another size")
+        change = f"changed by a factor of {finding.size_ratio:.3g}" if finding.size_ratio else "of another size"
+        details.append(f"and {change}" if has_new_shape else change)
     elif finding.kind == "absent":
         phrase = f"no {phrase}"
     return " ".join([phrase, *details]) + _on_axes(finding.axes)

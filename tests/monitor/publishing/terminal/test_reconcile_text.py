@@ -48,7 +48,7 @@ def test_findings_are_ordered_by_their_share() -> None:
     lines = [collapse_whitespace(line) for line in render_reconciliation(samples.explained())]
     at = lines.index("share finding conf. Allan deviation")
     assert lines[at + 1] == "96 % added line at 17.3 Hz on gz 99.8 % × 1.05 at τ = 0.02 s (gz)"
-    assert lines[at + 2] == "4.3 % retuned white noise N times 1.2 on gz > 99.9 % × 1.2 at τ = 0.01 s (gz)"
+    assert lines[at + 2] == "4.3 % white noise N changed by a factor of 1.2 on gz > 99.9 % × 1.2 at τ = 0.01 s (gz)"
     left = [collapse_whitespace(line) for line in render_reconciliation(samples.partly_explained())]
     assert "4.3 % left over: a difference in the spectrum from 6 to 11 Hz on gz" in left
 
