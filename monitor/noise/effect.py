@@ -7,6 +7,7 @@ An effect is a frozen dataclass of parameters. There are five kinds of effects.
 - ``WhiteNoiseGain`` and ``HeavyTails`` multiply the white noise of an axis by a factor.
 - An ``AxisPermutation`` replaces the output of an axis by the output of another axis.
 - A ``Transform`` modifies the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
+  Low-pass filters act before the leaks are added, because the measurements of other axes are already filtered.
 
 Simulated samples depend only on the random generator and the sample index, not on how the samples are divided into
 blocks. Effects do not access files, clocks or global state.

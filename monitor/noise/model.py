@@ -21,6 +21,7 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.signal_chain.bandwidth_limit import BandwidthLimit
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import (
     format_model_as_text_table,
@@ -164,7 +165,7 @@ class NoiseModel:
         return self._clock.convert_to_stated_rate(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return the spectrum of the sources of an axis, excluding leaks."""
+        """Return the spectrum of the filtered sources of an axis, excluding leaks."""
         effects = self.effects.get(axis, ())
         stepped = any(isinstance(effect, NoiseStep) for effect in effects)
         total = zero_spectrum(tau0_s)
@@ -172,11 +173,15 @@ class NoiseModel:
             if isinstance(effect, Source):
                 once = stepped and isinstance(effect, AngleRandomWalk)
                 total += nan_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
+        for effect in effects:
+            if isinstance(effect, BandwidthLimit):
+                total = effect.transform_spectrum(total)
         return total
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
         for transform in self.transforms_in_order(axis):
-            spectrum = transform.transform_spectrum(spectrum)
+            if not isinstance(transform, BandwidthLimit):
+                spectrum = transform.transform_spectrum(spectrum)
         return spectrum
 
     def transforms_in_order(self, axis: str) -> list[Transform]:

@@ -1,8 +1,8 @@
 """Simulate samples according to a noise model.
 
 Samples can be simulated in blocks of any size, and the block sizes do not affect the samples. For each axis, the
-sources are added first. The leaks from other axes are then added, and the transforms are applied to the sum. All
-effects are simulated at the true sample rate.
+sources are added first, and low-pass filters are applied to the sum. The leaks from other axes, which are already
+filtered, are then added, and the other transforms are applied. All effects are simulated at the true sample rate.
 
 Each effect has a separate random generator, so adding or removing an effect does not change the random numbers of other
 effects. The seed of a generator is derived from the seed of the simulation, the axis, the effect name, and the number
@@ -39,6 +39,7 @@ from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.common_vibration import CommonVibration
 from monitor.noise.effects.disturbances.heavy_tails import HeavyTails
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.signal_chain.bandwidth_limit import BandwidthLimit
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import prefix_config_errors
 from monitor.noise.temperature import Temperature, recorded_temperature
@@ -221,7 +222,10 @@ class ModelStream:
         elif isinstance(effect, Transform):
             with prefix_config_errors(f"{axis}.{effect.name}"):
                 running = effect.start_transform(self._true_hz, self._rng(axis, effect.name, occurrence))
-            line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)
+            if isinstance(effect, BandwidthLimit):
+                line.filters.append(running)
+            else:
+                line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running.drawn_random_values))
         else:
             raise TypeError(f"{effect.name} is not a source, leak, transform, permutation or change of the white noise")
@@ -257,9 +261,10 @@ class _AxisSimulator:
         self.white: list[RunningSource] = []
         self.others: list[RunningSource] = []
         self.gains: list[RunningGain] = []  # gains of the white noise
+        self.filters: list[RunningTransform] = []  # low-pass filters, in the order of the model
         self.leaks: list[AxisLeak] = []
         self.leaks_out = False
-        # These are the transforms and their positions in TRANSFORM_ORDER, sorted by position.
+        # These are the other transforms and their positions in TRANSFORM_ORDER, sorted by position.
         self._chain: list[tuple[int, RunningTransform]] = []
         # Copies of the transforms are needed to compute the measurement without leaks.
         self._alone: list[tuple[int, RunningTransform]] = []
@@ -285,7 +290,7 @@ class _AxisSimulator:
         self.leaks.append(leak)
 
     def sum_own_sources(self, block: SampleBlockContext, n: int) -> Floats:
-        """Return the sum [n] of the sources of the axis.
+        """Return the filtered sum [n] of the sources of the axis.
 
         White noise is added first, because gains multiply only the white noise.
         """
@@ -296,6 +301,8 @@ class _AxisSimulator:
             values *= gain.compute_gain(block.first, n)
         for series in self.others:
             series.add_next_samples(values, block)
+        for running in self.filters:
+            running.transform_in_place(values)
         return values
 
     def transform_without_leaks(self, own_sum: Floats) -> Floats:

@@ -249,10 +249,12 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
 
 def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
     """Return the probability that the true size of an effect differs from the size in the model."""
+    if hypothesis.effects[index].name in SERIES_SIZE_PARAMETERS:
+        effects = (*hypothesis.effects[:index], hypothesis.model[index], *hypothesis.effects[index + 1 :])
+        with_old_size = hypothesis.axis.fit(effects, hypothesis.fit.fixed_sizes | {index})
+        return erf(max(hypothesis.fit.log_likelihood - with_old_size.log_likelihood, 0.0) ** 0.5)
     now, before = effect_size(hypothesis.effects[index]), effect_size(hypothesis.model[index])
     error = hypothesis.fit.size_standard_error(index)
-    if hypothesis.effects[index].name in SERIES_SIZE_PARAMETERS and error > 0.0:
-        return erf(abs(now - before) / error / 2.0**0.5)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # one of the sizes is zero
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
@@ -282,7 +284,7 @@ def _parameters_with_bounds(
     if isinstance(effect, BandwidthLimit) and kind == "added":
         found["order"] = ParameterInterval(float(effect.stages))
         found["kind"] = ParameterInterval(effect.kind or FILTER_KINDS[0])
-    if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
+    if isinstance(effect, Sinusoidal) and effect.phase is not None and index not in hypothesis.fit.fixed_sizes:
         # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
         error = 2.0 * Z95 * hypothesis.fit.size_standard_error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
@@ -292,6 +294,8 @@ def _parameters_with_bounds(
 def _coefficient_bounds(hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
     effect = hypothesis.effects[index]
     value = float(getattr(effect, name))
+    if index in hypothesis.fit.fixed_sizes:
+        return ParameterInterval(value)
     error = hypothesis.fit.coefficient_standard_errors(index)[linear_coefficient_names(effect).index(name)]
     return ParameterInterval(value, value - Z95 * float(error), value + Z95 * float(error))
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from drivers.data_types import AXES
-from monitor.noise.effect import Effect
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     BandwidthLimit,
@@ -304,8 +304,9 @@ def _search_all_axes(
     first_found = dict(zip(axes, run.map_function(search_named_axis, axes), strict=True))
     found = dict(first_found)
     for name, wrong in find_leaks_in_wrong_direction(first_found, null).items():
-        leak_sources = {source: one for source, one in axes[name].leak_sources.items() if source not in wrong}
-        axes[name] = replace(axes[name], leak_sources=leak_sources)
+        of_model = wrong & {effect.source for effect in effects[name] if isinstance(effect, AxisLeak)}
+        leak_sources = {k: one for k, one in axes[name].leak_sources.items() if k not in wrong - of_model}
+        axes[name] = replace(axes[name], leak_sources=leak_sources, sources_of_unchanged_leaks=of_model)
         found[name] = search_named_axis(name)
     return _AxesSearchResult(add_opposite_leaks_as_alternatives(found, first_found), error)
 

@@ -73,7 +73,7 @@ WHOLE_RECORDING: Final = slice(None)
 MAX_CACHED_PRODUCTS: Final = 2048
 MAX_CACHED_BASES: Final = 512
 MAX_CACHED_UNIT_EFFECTS: Final = 4096
-MIN_LINE_POWER_GAIN: Final = 1e-6
+MIN_LINE_POWER_GAIN: Final = 1e-12
 """Smallest assumed power gain of a filter for a line. A smaller gain would give a huge amplitude before the filter."""
 INITIAL_FLOOR_RATIO: Final = 1e-3
 """Smallest starting value of the white noise added after a low-pass filter, relative to the total power."""
@@ -164,6 +164,7 @@ class Axis:
     value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
     is_model_fitted: bool = False  # True if the model under test was fitted to this recording
+    sources_of_unchanged_leaks: frozenset[str] = frozenset()  # sources of leaks of the model whose size is kept
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
     used_count: Floats = field(init=False)  # [m] number of coefficients, or 0 for bins that are not used

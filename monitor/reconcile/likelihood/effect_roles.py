@@ -19,6 +19,7 @@ from monitor.noise.effects import (
     CommonVibration,
     ConstantBias,
     PoissonSteps,
+    PulseTrain,
     RandomTelegraph,
     RateRamp,
     Resolution,
@@ -62,13 +63,13 @@ def is_noise_effect(effect: Effect) -> bool:
     return getattr(effect, NOISE_SIZE_PARAMETERS.get(effect.name, ""), None) is not None
 
 
-def has_lasting_size(effect: Effect) -> bool:
-    """Return True if the size of an effect is a property of the sensor, and therefore equal in all its recordings.
+def is_repeatable_series(effect: Effect) -> bool:
+    """Return True if a deterministic effect has the same size in all recordings of a sensor.
 
-    This excludes the sizes of events that happen only once.
+    Events that happen only once are excluded, and pulses, because the height depends on the fitted delay.
     """
     is_series = effect.name in SIZE_PARAMETERS and effect.name not in NOISE_SIZE_PARAMETERS
-    return is_noise_effect(effect) or (is_series and effect.name not in ONE_TIME_EFFECTS)
+    return is_series and effect.name not in ONE_TIME_EFFECTS and not isinstance(effect, PulseTrain)
 
 
 def has_same_size(a: Effect, b: Effect) -> bool:

@@ -12,13 +12,17 @@ from typing import Final
 import numpy as np
 
 from monitor.common.distributions import HALF_CHI2_95, Z95
-from monitor.noise.effect import Effect
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasStep,
     CommonVibration,
     ExponentiallyCorrelated,
     PulseTrain,
+    RandomSampleHold,
+    SampleRateError,
+    Saturation,
+    UnitError,
     VarianceModulation,
     WanderingVariance,
 )
@@ -26,8 +30,8 @@ from monitor.reconcile.effect_properties import SERIES_SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import (
     effect_size,
-    has_lasting_size,
     is_noise_effect,
+    is_repeatable_series,
     with_effect_size,
 )
 from monitor.reconcile.likelihood.periodic_pulse_search import find_pulse_delay
@@ -40,6 +44,8 @@ RESIZE_PENALTY_NATS: Final = 7.0
 If the size in the model is true, the gain exceeds 7 nats by chance with the probability P(χ²₁ > 14) = 0.02 %. A
 recording with six axes has about 24 sizes, so this occurs in about one of 200 recordings.
 """
+UNMODELLED_TRANSFORMS: Final = (RandomSampleHold, SampleRateError, Saturation, UnitError)
+"""Transforms that change deterministic effects in a way that the fit does not describe."""
 STEP_TIME_95_NATS: Final = -log(1.0 - sqrt(0.95))
 """Loss of log-likelihood at the true time of a step that is exceeded with a probability of 5 %, in nats."""
 MIN_INTERVAL_LOG: Final = 1e-6
@@ -85,7 +91,7 @@ class Hypothesis:
     @property
     def resized_model_effect_count(self) -> int:
         """Number of effects of the model with a fitted size that the model determines."""
-        return len(indices_of_lasting_sizes(self.axis, self.model) - self.fit.fixed_sizes)
+        return len(compared_size_indices(self.axis, self.model) - self.fit.fixed_sizes)
 
     @property
     def resize_penalty(self) -> float:
@@ -116,7 +122,7 @@ def fit_with_model_sizes(axis: Axis, model: Effects) -> Hypothesis:
         Effects of the axis in the model under test.
     """
     model = with_fitted_mean_variance(axis, _with_fitted_timing(axis, model))
-    return Hypothesis(model, axis.fit(model, indices_of_lasting_sizes(axis, model)))
+    return Hypothesis(model, axis.fit(model, compared_size_indices(axis, model)))
 
 
 def fit_deterministic_effects(axis: Axis, model: Effects) -> AxisFit:
@@ -198,7 +204,8 @@ def with_fitted_mean_variance(axis: Axis, model: Effects) -> Effects:
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
     """Fit added effects together with a noise model, and change as few sizes of the model as possible.
 
-    The gain of a common vibration is not fitted, because the spectrum of one axis does not determine the gain.
+    The gain of a common vibration is not fitted, because the spectrum of one axis does not determine the gain. The
+    coefficients of unchanged leaks are not fitted either.
 
     Parameters
     ----------
@@ -211,7 +218,12 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
     """
     effects = (*model, *added)
     common = frozenset(len(model) + at for at, effect in enumerate(added) if isinstance(effect, CommonVibration))
-    fixed_sizes = indices_of_lasting_sizes(axis, model) | common
+    common |= frozenset(
+        at
+        for at, effect in enumerate(model)
+        if isinstance(effect, AxisLeak) and effect.source in axis.sources_of_unchanged_leaks
+    )
+    fixed_sizes = compared_size_indices(axis, model) | common
     best = Hypothesis(model, axis.fit(effects, fixed_sizes))
     if fixed_sizes == common:
         return best
@@ -228,11 +240,11 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
     return free if free.penalised_log_likelihood > best.penalised_log_likelihood else best
 
 
-def indices_of_lasting_sizes(axis: Axis, model: Effects) -> frozenset[int]:
-    """Return the indices of the effects whose size the model determines for each recording of the sensor.
+def compared_size_indices(axis: Axis, model: Effects) -> frozenset[int]:
+    """Return the indices of the effects whose size in the model is compared with the recording.
 
-    If the model was fitted to the same recording, the deterministic effects are fitted again together with added
-    effects, so only the sizes of noise effects are included.
+    The sizes of noise effects are always included. The sizes of repeatable deterministic effects are included, unless
+    the model was fitted to the same recording or contains a transform whose effect on them is not modelled.
 
     Parameters
     ----------
@@ -241,9 +253,9 @@ def indices_of_lasting_sizes(axis: Axis, model: Effects) -> frozenset[int]:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    if axis.is_model_fitted:
+    if axis.is_model_fitted or any(isinstance(effect, UNMODELLED_TRANSFORMS) for effect in model):
         return noise_effect_indices(model)
-    return frozenset(at for at, effect in enumerate(model) if has_lasting_size(effect))
+    return frozenset(at for at, effect in enumerate(model) if is_noise_effect(effect) or is_repeatable_series(effect))
 
 
 def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:
@@ -353,6 +365,8 @@ def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
         Index of the effect.
     """
     value, error = effect_size(fit.effects[effect_index]), fit.size_standard_error(effect_index)
+    if effect_index in fit.fixed_sizes:
+        return ParameterInterval(value)
     if fit.effects[effect_index].name in SERIES_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):

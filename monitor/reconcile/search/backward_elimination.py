@@ -36,9 +36,9 @@ from monitor.reconcile.likelihood.effect_roles import effect_size, has_same_size
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
     Hypothesis,
+    compared_size_indices,
     compute_size_interval,
     find_maximum_by_golden_section,
-    indices_of_lasting_sizes,
 )
 from monitor.reconcile.recording_checks.checks import TRIADS
 from monitor.reconcile.search.candidate_effects import fit_resonance
@@ -228,7 +228,7 @@ def changed_sizes(hypothesis: Hypothesis) -> list[int]:
     """Return the indices of the effects of the model whose size was changed."""
     return [
         at
-        for at in sorted(indices_of_lasting_sizes(hypothesis.axis, hypothesis.model))
+        for at in sorted(compared_size_indices(hypothesis.axis, hypothesis.model))
         if not has_same_size(hypothesis.effects[at], hypothesis.model[at])
     ]
 
@@ -289,5 +289,5 @@ def _with_factor(hypothesis: Hypothesis, factor: float) -> Hypothesis:
     """Fit the hypothesis with the old sizes of the noise model times a common factor."""
     added = tuple(effect for effect in hypothesis.added if not isinstance(effect, ScaleFactor))
     effects = (*hypothesis.model, *added, ScaleFactor(factor=factor))
-    fixed_sizes = indices_of_lasting_sizes(hypothesis.axis, hypothesis.model)
+    fixed_sizes = compared_size_indices(hypothesis.axis, hypothesis.model)
     return Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, fixed_sizes))

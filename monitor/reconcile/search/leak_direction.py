@@ -7,7 +7,7 @@ The following model describes the axes a and b:
     a = d·b + noise of a,    b = e·a + noise of b.
 
 The joint log-likelihood is the sum of the log-likelihoods of both axes and of n ln |1 − d·e|, where n is the number of
-coefficients of an axis.
+coefficients of an axis. The last term shifts the most likely value of d if e is not zero.
 """
 
 from collections.abc import Mapping
@@ -28,6 +28,7 @@ class _Leak:
     source: str
     coefficient: float
     model_coefficient: float  # in the model under test, or 0 for an added leak
+    standard_error: float  # of the coefficient
     gain: float  # penalised log-likelihood gain over the model under test, nats
 
 
@@ -51,9 +52,8 @@ def find_leaks_in_wrong_direction(
             finding = found[leak.source].final.findings["other_axes"]
             if finding.where.source == axis and finding.gain > null[leak.source]["other_axes"].threshold:
                 wrong[leak.source] = wrong.get(leak.source, frozenset()) | {axis}
-            opposite = _leak_from(axis, found[leak.source].hypothesis)
-            is_added = leak.model_coefficient == 0.0  # only added leaks can be excluded
-            if opposite is not None and is_added and _advantage(search.hypothesis, leak, opposite) < 0.0:
+            opposite = _find_leak_from(axis, found[leak.source].hypothesis)
+            if opposite is not None and _advantage(search.hypothesis, leak, opposite) < 0.0:
                 wrong[axis] = wrong.get(axis, frozenset()) | {leak.source}
     return wrong
 
@@ -79,7 +79,7 @@ def _with_alternatives(
     rounds = list(search.rounds)
     for leak in _find_changed_leaks(search.hypothesis):
         other = first_found[leak.source].hypothesis if leak.source in first_found else None
-        opposite = None if other is None else _leak_from(name, other) or _try_leak_from(name, other)
+        opposite = None if other is None else _find_leak_from(name, other) or _fit_added_leak_from(name, other)
         at = next((at for at, one in enumerate(rounds) if _has_fitted_leak(one.hypothesis, leak.source)), None)
         if opposite is None or at is None:
             continue
@@ -99,7 +99,7 @@ def _find_changed_leaks(hypothesis: Hypothesis) -> list[_Leak]:
     return [leak for leak in leaks if leak.coefficient != leak.model_coefficient]
 
 
-def _leak_from(source: str, hypothesis: Hypothesis) -> _Leak | None:
+def _find_leak_from(source: str, hypothesis: Hypothesis) -> _Leak | None:
     """Return the leak from an axis, or None if the hypothesis contains none."""
     for at, effect in enumerate(hypothesis.effects):
         if isinstance(effect, AxisLeak) and effect.source == source:
@@ -113,13 +113,13 @@ def _describe_leak(hypothesis: Hypothesis, at: int, effect: AxisLeak) -> _Leak:
         place = at - hypothesis.model_effect_count
         less = hypothesis.refit_with_other_added_effects(hypothesis.added[:place] + hypothesis.added[place + 1 :])
         gain = hypothesis.penalised_log_likelihood - less.penalised_log_likelihood - PENALTY_NATS[effect.name]
-        return _Leak(effect.source, effect.coefficient, 0.0, gain)
+        return _Leak(effect.source, effect.coefficient, 0.0, hypothesis.fit.size_standard_error(at), gain)
     known = hypothesis.model[at]
     assert isinstance(known, AxisLeak)
     effects = (*hypothesis.effects[:at], known, *hypothesis.effects[at + 1 :])
     less = Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, hypothesis.fit.fixed_sizes | {at}))
     gain = hypothesis.penalised_log_likelihood - less.penalised_log_likelihood
-    return _Leak(effect.source, effect.coefficient, known.coefficient, gain)
+    return _Leak(effect.source, effect.coefficient, known.coefficient, hypothesis.fit.size_standard_error(at), gain)
 
 
 def _has_fitted_leak(hypothesis: Hypothesis, source: str) -> bool:
@@ -130,7 +130,7 @@ def _has_fitted_leak(hypothesis: Hypothesis, source: str) -> bool:
     )
 
 
-def _try_leak_from(source: str, hypothesis: Hypothesis) -> _Leak | None:
+def _fit_added_leak_from(source: str, hypothesis: Hypothesis) -> _Leak | None:
     """Add a leak from an axis to a hypothesis. Return None if the axis cannot leak."""
     axis = hypothesis.axis
     if source not in axis.leak_sources or source[0] != axis.name[0]:
@@ -139,15 +139,23 @@ def _try_leak_from(source: str, hypothesis: Hypothesis) -> _Leak | None:
     effect = leaking.added[-1]
     assert isinstance(effect, AxisLeak)
     gain = leaking.penalised_log_likelihood - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name]
-    return _Leak(source, effect.coefficient, 0.0, gain)
+    error = leaking.fit.size_standard_error(len(leaking.effects) - 1)
+    return _Leak(source, effect.coefficient, 0.0, error, gain)
 
 
 def _advantage(hypothesis: Hypothesis, leak: _Leak, opposite: _Leak) -> float:
     """Return the difference between the joint log-likelihoods of a leak and of the opposite leak, in nats."""
     n = hypothesis.axis.coefficients.size
+    return _joint_gain(leak, opposite.model_coefficient, n) - _joint_gain(opposite, leak.model_coefficient, n)
 
-    def log_determinant(one: _Leak, other: _Leak) -> float:
-        determinant = abs(1.0 - one.coefficient * other.model_coefficient)
-        return n * log(determinant) if determinant > 0.0 else -inf
 
-    return leak.gain + log_determinant(leak, opposite) - opposite.gain - log_determinant(opposite, leak)
+def _joint_gain(leak: _Leak, opposite_coefficient: float, n: int) -> float:
+    """Return the gain of a leak if the model contains a leak in the opposite direction, in nats.
+
+    The gain is the maximum of g − (d − d₁)²/(2s²) + n ln |1 − d·e| over d, to first order in e. Here, d₁ is the fitted
+    coefficient with the standard error s, and e is the coefficient of the opposite leak.
+    """
+    shift = -n * opposite_coefficient * leak.standard_error**2
+    determinant = abs(1.0 - (leak.coefficient + shift) * opposite_coefficient)
+    loss = 0.5 * (n * opposite_coefficient * leak.standard_error) ** 2
+    return leak.gain - loss + n * log(determinant) if determinant > 0.0 else -inf

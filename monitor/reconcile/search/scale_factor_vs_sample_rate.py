@@ -10,7 +10,7 @@ from math import exp, fsum, log
 
 from drivers.data_types import AXES
 from monitor.noise.effects import SampleRateError, ScaleFactor
-from monitor.reconcile.likelihood.hypothesis_fit import RESIZE_PENALTY_NATS, Hypothesis, indices_of_lasting_sizes
+from monitor.reconcile.likelihood.hypothesis_fit import RESIZE_PENALTY_NATS, Hypothesis, compared_size_indices
 from monitor.reconcile.search.sample_rate_from_spectrum import convert_effect_to_stated_time
 from monitor.reconcile.search.search import AxisSearchResult
 from monitor.reconcile.search.trials import Trial
@@ -44,7 +44,7 @@ def _gain_of_sample_rate(hypothesis: Hypothesis, ratio: float) -> float:
     """Return the log-likelihood gain if a wrong sample rate replaces the scale factor of an axis."""
     converted = tuple(convert_effect_to_stated_time(effect, ratio) for effect in hypothesis.model)
     added = tuple(effect for effect in hypothesis.added if not isinstance(effect, ScaleFactor))
-    fit = hypothesis.axis.fit((*converted, *added), indices_of_lasting_sizes(hypothesis.axis, converted))
+    fit = hypothesis.axis.fit((*converted, *added), compared_size_indices(hypothesis.axis, converted))
     return fit.log_likelihood - hypothesis.fit.log_likelihood
 
 

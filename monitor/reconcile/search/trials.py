@@ -44,16 +44,18 @@ from monitor.reconcile.effect_properties import PENALTY_NATS
 from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import (
+    RESIZE_PENALTY_NATS,
     Hypothesis,
+    compared_size_indices,
     find_maximum_by_golden_section,
+    fit_shape_parameter,
     fit_with_fewest_changes,
-    indices_of_lasting_sizes,
     refit_correlation_times,
 )
 from monitor.reconcile.likelihood.outlier_fit import convert_student_to_gaussian, student_misfit_z
 from monitor.reconcile.likelihood.variance_change_tests import compare_variance_change_forms, gains_in_frequency_bands
 from monitor.reconcile.likelihood.wandering_variance_fit import FittedWanderingVariance, estimate_wandering_std
-from monitor.reconcile.likelihood.whitening import MIN_NOISE_GAIN, WhitenedAxis
+from monitor.reconcile.likelihood.whitening import MIN_NOISE_GAIN, WhitenedAxis, compute_periodogram, whiten_axis
 from monitor.reconcile.preparation.value_artifacts import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidate_effects import (
@@ -105,6 +107,10 @@ MAX_BAND_FRACTION: Final = 0.25
 """Largest width of a narrow frequency band, as a fraction of the sample rate."""
 MOVE_ADVANTAGE_NATS: Final = 4.0
 """Score advantage, in nats, of a moved line over an additional line, which would need two more fitted sizes."""
+MAX_NEIGHBOUR_CYCLES: Final = 10.0
+"""Largest change of the frequency of a line that is searched near the line, in cycles per recording."""
+MIN_NEIGHBOUR_CYCLES: Final = 0.1
+"""Smallest such change. A smaller change is hardly distinguishable from another phase."""
 MAX_MOVED_SIZE_RATIO: Final = 3.0
 """Largest ratio of the sizes of a line before and after a change of the frequency."""
 NOISE_PRIORITY_NATS: Final = 5.0
@@ -416,11 +422,8 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
 
 
 def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> list[Trial]:
-    """Try lines and resonances of the model at the frequencies of new lines and resonances of similar size.
-
-    A moved line has nearly the same likelihood as an additional line if the amplitude of the old line becomes zero.
-    """
-    found: list[Trial] = []
+    """Try lines and resonances of the model at the frequencies of new lines and resonances of similar size."""
+    moved: list[tuple[int, Effect]] = []
     for new in (trial.effect for trial in trials if trial.score > 0.0):
         for at, known in enumerate(hypothesis.model):
             if not isinstance(new, Sinusoidal | Narrowband) or type(known) is not type(new):
@@ -429,17 +432,58 @@ def _moved_feature_trials(hypothesis: Hypothesis, trials: Sequence[Trial]) -> li
             if isinstance(new, Narrowband):
                 others = (*hypothesis.effects[:at], *hypothesis.effects[at + 1 :])
                 effect = fit_resonance(hypothesis.axis, others, replace(new, sigma=effect_size(known)))
-            model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
-            moved = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
-            size_ratio = effect_size(moved.effects[at]) / max(effect_size(known), 1e-300)
-            if not 1.0 / MAX_MOVED_SIZE_RATIO < size_ratio < MAX_MOVED_SIZE_RATIO:
-                continue
-            gain = moved.penalised_log_likelihood - hypothesis.penalised_log_likelihood
-            assert isinstance(effect, Sinusoidal | Narrowband)
-            distance = abs(float(np.log(effect.frequency / known.frequency)))
-            score = gain - PENALTY_NATS[new.name] + MOVE_ADVANTAGE_NATS - distance
-            found.append(Trial(new.name, effect, score, moved=at, replaced=known))
+            moved.append((at, effect))
+    moved += _lines_at_neighbouring_frequencies(hypothesis)
+    return [trial for at, effect in moved for trial in _moved_feature_trial(hypothesis, at, effect)]
+
+
+def _lines_at_neighbouring_frequencies(hypothesis: Hypothesis) -> list[tuple[int, Effect]]:
+    """Find the neighbouring frequency of each line of the model whose size or frequency differs from the recording.
+
+    A line that moves by only a few cycles per recording leaves two peaks that are no lines.
+    """
+    axis, fit = hypothesis.axis, hypothesis.fit
+    found: list[tuple[int, Effect]] = []
+    for at, known in enumerate(hypothesis.model):
+        if not isinstance(known, Sinusoidal) or at not in fit.fixed_sizes:
+            continue
+        if axis.fit(fit.effects, fit.fixed_sizes - {at}).log_likelihood - fit.log_likelihood < RESIZE_PENALTY_NATS:
+            continue
+        others = (*fit.effects[:at], *fit.effects[at + 1 :])
+        fixed_sizes = frozenset(one - (one > at) for one in fit.fixed_sizes - {at})
+        periodogram = compute_periodogram(whiten_axis(axis.fit(others, fixed_sizes)).series)
+        spacing_hz = 0.5 * axis.rate_hz / (periodogram.size - 1)
+        cycles = MAX_NEIGHBOUR_CYCLES / axis.length_s
+        first = max(round((known.frequency - cycles) / spacing_hz), 1)
+        near = periodogram[first : round((known.frequency + cycles) / spacing_hz) + 1]
+        if near.size == 0:
+            continue
+        peak = replace(known, frequency=(first + int(np.argmax(near))) * spacing_hz)
+        factor = float(np.exp(0.5 / (peak.frequency * axis.length_s)))
+        moved = fit_shape_parameter(axis, others, peak, "frequency", factor)
+        assert isinstance(moved, Sinusoidal)
+        if abs(moved.frequency - known.frequency) * axis.length_s > MIN_NEIGHBOUR_CYCLES:
+            found.append((at, moved))
     return found
+
+
+def _moved_feature_trial(hypothesis: Hypothesis, at: int, effect: Effect) -> list[Trial]:
+    """Try another frequency of a line or resonance of the model, if the size is similar.
+
+    A moved line has nearly the same likelihood as an additional line if the amplitude of the old line becomes zero.
+    """
+    known = hypothesis.model[at]
+    assert isinstance(effect, Sinusoidal | Narrowband)
+    assert isinstance(known, Sinusoidal | Narrowband)
+    model = (*hypothesis.model[:at], effect, *hypothesis.model[at + 1 :])
+    moved = fit_with_fewest_changes(hypothesis.axis, hypothesis.added, model)
+    size_ratio = effect_size(moved.effects[at]) / max(effect_size(known), 1e-300)
+    if not 1.0 / MAX_MOVED_SIZE_RATIO < size_ratio < MAX_MOVED_SIZE_RATIO:
+        return []
+    gain = moved.penalised_log_likelihood - hypothesis.penalised_log_likelihood
+    distance = abs(float(np.log(effect.frequency / known.frequency)))
+    score = gain - PENALTY_NATS[effect.name] + MOVE_ADVANTAGE_NATS - distance
+    return [Trial(effect.name, effect, score, moved=at, replaced=known)]
 
 
 def _low_pass_trials_beside_known_filter(hypothesis: Hypothesis) -> list[Trial]:
@@ -537,7 +581,7 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     If the factor fits nearly as well as several changed sizes, it gets at least the score of these sizes.
     """
     effects = (*hypothesis.model, *hypothesis.added)
-    fixed_sizes = indices_of_lasting_sizes(hypothesis.axis, hypothesis.model)
+    fixed_sizes = compared_size_indices(hypothesis.axis, hypothesis.model)
 
     def log_likelihood_with_axis_scale_factor(log_factor: float) -> float:
         return hypothesis.axis.fit(

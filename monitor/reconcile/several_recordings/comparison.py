@@ -240,7 +240,11 @@ def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation
     given = find_closest_effect(
         result.baseline.effects[axis], step.effect, effect_parameters(find_effect_of_step(result.model, axis, step))
     )
-    return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
+    known = {name: getattr(given, name) for name in step.parameters if name not in NON_SIZE_PARAMETERS}
+    return max(
+        (distance_in_sigma(step.parameters[name], value) for name, value in known.items() if value is not None),
+        default=0.0,
+    )
 
 
 def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, PooledParameter]:

@@ -18,7 +18,7 @@ from typing import Final
 from drivers.data_types import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import BandwidthLimit, Narrowband, Sinusoidal
-from monitor.reconcile.effect_properties import SIZE_PARAMETERS
+from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, SIZE_PARAMETERS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AllanInfluence,
@@ -166,6 +166,8 @@ def _size_ratio(axis: str, step: AddedOrResizedEffect, r: Reconciliation) -> flo
         return None
     if step.effect == "scale_factor":
         return now.value
+    if any(coefficient in step.parameters for coefficient in EFFECT_PROPERTIES[step.effect].sizes[1:]):
+        return None  # several coefficients have no common ratio
     if step.kind != "retuned":
         return None
     before = _effect_before(axis, step, r, name)

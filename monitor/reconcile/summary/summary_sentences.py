@@ -157,11 +157,20 @@ def describe_finding(finding: RankedGapCause) -> str:
         details.append(shape.format(**numbers))
         has_new_shape = True
     if finding.kind == "retuned" and not (has_new_shape and _is_nearly_one(finding.size_ratio)):
-        change = f"changed by a factor of {finding.size_ratio:.3g}" if finding.size_ratio else "of another size"
+        change = _describe_size_ratio(finding.size_ratio)
         details.append(f"and {change}" if has_new_shape else change)
     elif finding.kind == "absent":
         phrase = f"no {phrase}"
     return " ".join([phrase, *details]) + _on_axes(finding.axes)
+
+
+def _describe_size_ratio(ratio: float | None) -> str:
+    if not ratio:
+        return "of another size"
+    if ratio > 0.0:
+        return f"changed by a factor of {ratio:.3g}"
+    size = "" if _is_nearly_one(-ratio) else f" and {-ratio:.3g} times the size"
+    return f"with the opposite sign{size}"
 
 
 def _is_nearly_one(ratio: float | None) -> bool:

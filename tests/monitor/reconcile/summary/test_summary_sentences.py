@@ -88,7 +88,8 @@ def test_vibration_and_disturbances_have_their_own_advice() -> None:
         ({"kind": "absent"}, "no line at 17.3 Hz on gz"),
         ({"kind": "retuned", "size_ratio": 0.5}, "line at 17.3 Hz changed by a factor of 0.5 on gz"),
         ({"kind": "retuned", "size_ratio": 1.01, "old_frequency": 17.0}, "line moved from 17 to 17.3 Hz on gz"),
-        ({"kind": "retuned", "size_ratio": 2.0, "old_frequency": 17.0}, "line moved from 17 to 17.3 Hz and changed by a factor of 2 on gz"),
+        ({"kind": "retuned", "size_ratio": 2.0, "old_frequency": 17.0}, "line moved from 17 to 17.3 Hz "
+         "and changed by a factor of 2 on gz"),
         ({"kind": "retuned"}, "line at 17.3 Hz of another size on gz"),
         ({"effect": "narrowband", "kind": "retuned", "size_ratio": 1.01,
           "parameters": {"frequency": around(17.3, 0.1), "bandwidth": around(2.0, 0.1)}},
