@@ -190,11 +190,14 @@ def _predict_half(half: Axis, learned: AxisFit, fitted: frozenset[int]) -> AxisF
     fitted again.
     """
     effects = learned.effects
-    free = half.fit(effects, noise_effect_indices(effects) - fitted)
+    fixed_sizes = (noise_effect_indices(effects) | learned.fixed_sizes) - fitted
+    free = half.fit(effects, fixed_sizes)
     beta = free.whittle.beta.copy()
     known: list[int] = []
     for (at, place), gain in zip(free.regressor_slices, free.regressor_gains, strict=True):
         effect = effects[at]
+        if at in fixed_sizes:
+            continue
         if isinstance(effect, Sinusoidal):  # keep the fitted phase and use the learned amplitude
             beta[place] *= gain * effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
         else:
