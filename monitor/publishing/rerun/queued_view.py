@@ -37,8 +37,8 @@ CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has
 PATIENCE_S: Final = 1.0  # longest duration of such a check
 STALL_TIMEOUT_S: Final = 2.0  # a Rerun call that takes longer shows that the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-LAYOUT_PERIODS_S: Final = (2.0, 8.0, 30.0)
-"""Shortest interval before the second, the third and each further layout [s].
+LAYOUT_PERIODS_S: Final = (2.0, 10.0)
+"""Shortest interval before the second layout and before each further layout [s].
 
 A new layout selects the first page. A viewer that joins late receives all layouts before the newest results.
 """

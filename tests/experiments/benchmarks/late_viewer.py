@@ -1,14 +1,13 @@
 """Time until a viewer that joins late shows everything: ``python -m tests.experiments.benchmarks.late_viewer``.
 
-The demo runs with the web viewer. After some time, the benchmark reads the messages of the Rerun server as a browser
+The demo runs with the web viewer. After some time, the benchmark reads the messages of the Rerun server as a viewer
 reads them. For each group of entities, the table shows when every entity of the group has arrived for the first time.
-With the option ``--pictures``, Chromium then opens the page and takes a screenshot whenever it can.
+With the option ``--pictures``, a second viewer without a screen then connects to the server and saves screenshots.
 
     python -m tests.experiments.benchmarks.late_viewer [--seconds 150] [--pictures FOLDER]
 """
 
 import argparse
-import base64
 import http.client
 import time
 from collections.abc import Iterator
@@ -16,16 +15,17 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
-from urllib.parse import quote
 
 import pyarrow as pa
 
 from monitor.publishing.rerun import sinks
 from monitor.simulator.demo_config import build_demo_config
-from tests.experiments.pictures import browser, free_port, running, wait_until
+from tests.experiments.pictures import SIZE, free_port, running, wait_until
 
-DURATION_S = 60.0
-"""Duration of the reading, and of the screenshots [s]."""
+READ_S = 10.0
+"""Duration of the reading [s]."""
+SCREENSHOTS_S = 30.0
+"""Time after which no further screenshot is taken [s]."""
 GROUPS = {
     "state and table of coefficients": ("status", "coefficients"),
     "curves of the Allan plots": ("allan/??", "allan/*/curves"),
@@ -41,7 +41,7 @@ def main() -> None:
     """Run the demo, join late and print when the entities arrive."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=150.0, help="time between the first result and the late join")
-    parser.add_argument("--pictures", type=Path, help="folder for screenshots of Chromium")
+    parser.add_argument("--pictures", type=Path, help="folder for screenshots of a second viewer")
     arguments = parser.parse_args()
     config, port, web_port = build_demo_config(), free_port(), free_port()
     config = replace(
@@ -54,9 +54,7 @@ def main() -> None:
         time.sleep(arguments.seconds)
         print_arrivals(config.devices[0].name, port)
         if arguments.pictures is not None:
-            save_screenshots(
-                f"http://127.0.0.1:{web_port}/?url={quote(sinks.server_url(port), safe='')}", arguments.pictures
-            )
+            save_screenshots(port, arguments.pictures)
 
 
 def print_arrivals(device: str, port: int) -> None:
@@ -66,7 +64,7 @@ def print_arrivals(device: str, port: int) -> None:
     for number, message in enumerate(read_messages(port), 1):
         since_s, size = time.monotonic() - begun_s, size + len(message)
         arrivals.setdefault(entity_path(message), (since_s, number))
-        if since_s > DURATION_S:
+        if since_s > READ_S:
             print(f"{number} messages with {size / 1e6:.1f} MB in {since_s:.0f} s")
             break
     print("| entities | number | all arrived after | number of messages |")
@@ -135,18 +133,24 @@ def protobuf_fields(data: bytes) -> dict[int, int | bytes]:
     return fields
 
 
-def save_screenshots(url: str, folder: Path) -> None:
-    """Open the page in Chromium, and save screenshots named after the time since the page was requested."""
+def save_screenshots(port: int, folder: Path) -> None:
+    """Connect a viewer without a screen, and save screenshots named after the time since its start."""
+    from rerun.experimental import ViewerClient
+
     folder.mkdir(parents=True, exist_ok=True)
-    with browser() as page:
-        begun_s = time.monotonic()
-        page.call("Page.navigate", url=f"{url}&renderer=webgl&hide_welcome_screen=1")
-        while time.monotonic() - begun_s < DURATION_S:
-            try:
-                picture = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
-            except RuntimeError:  # the page is not loaded yet
-                continue
-            (folder / f"{time.monotonic() - begun_s:04.1f}s.png").write_bytes(picture)
+    own_port, begun_s = free_port(), time.monotonic()
+    child = sinks.ViewerProcess([
+        *("--bind", "127.0.0.1", "--port", str(own_port), "--headless", "--window-size", f"{SIZE[0]}x{SIZE[1]}"),
+        *("--hide-welcome-screen", sinks.server_url(port)),
+    ])  # fmt: skip
+    try:
+        wait_until(lambda: sinks.is_listening(own_port), 30.0)
+        client = ViewerClient(sinks.server_url(own_port))
+        while time.monotonic() - begun_s < SCREENSHOTS_S:
+            client.save_screenshot(str(folder / "newest.png"))
+            (folder / "newest.png").rename(folder / f"{time.monotonic() - begun_s:04.1f}s.png")
+    finally:
+        child.terminate()
 
 
 if __name__ == "__main__":
