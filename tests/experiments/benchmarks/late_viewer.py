@@ -67,7 +67,7 @@ def print_arrivals(device: str, port: int) -> None:
         if since_s > READ_S:
             print(f"{number} messages with {size / 1e6:.1f} MB in {since_s:.0f} s")
             break
-    print("| entities | number | all arrived after | number of messages |")
+    print("| entities | number | all arrived after | last message |")
     print("| --- | --- | --- | --- |")
     for group, patterns in GROUPS.items():
         found = [
