@@ -49,8 +49,6 @@ KEY_ROW: Final = 1.25
 KEY_BELOW: Final = 2.15
 """Distance of the first row of the key below the plot [chart units]."""
 KEY_TEXT: Final = 3.3
-GRID_PERIOD_NS: Final = 30_000_000_000
-"""Interval at which an unchanged grid is drawn again, because a viewer that joins late may not receive old data."""
 GRID_DASH: Final = 0.15
 FEW_TICKS: Final = "few_ticks"
 """Last part of the path of the tick labels for small plots."""
@@ -85,8 +83,7 @@ class AllanPlotPair:
     def __init__(self, log: Log, path: str, units: UnitSystem = DEFAULT_UNITS) -> None:
         self._log = log
         self._path = path
-        # Time interval, grid, signs and poorly fitted axes
-        self._drawn: dict[Kind, tuple[int, ChartDecadeRange, list[str], list[str]]] = {}
+        self._drawn: dict[Kind, tuple[ChartDecadeRange, list[str], list[str]]] = {}  # grid, signs, poorly fitted axes
         self._units = units
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
@@ -111,7 +108,7 @@ class AllanPlotPair:
             )
             poor = [one.axis for one in curves if one.poorly_fitted]
             signs = _signs_in_use(curves)
-            frame = estimate.t_ns // GRID_PERIOD_NS, scale, signs, poor
+            frame = scale, signs, poor
             if self._drawn.get(kind) != frame:
                 self._drawn[kind] = frame
                 self._draw_grid(kind, scale, [one.axis for one in curves])

@@ -59,11 +59,12 @@ DESCRIPTIONS: Final = {
     "dynamic/..": "**Heat maps:** time runs to the right and averaging time upwards; vermilion is noisier, and blue is "
     "quieter, than the median.",
     "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device.",
-    "thermal/..": "**Bias:** the grey line is the prediction from temperature, and thin lines are its 95 % interval.",
+    "thermal/..": "**Bias:** mean of each interval in colour, prediction from temperature in grey, and its 95 % "
+    "interval in thin lines.",
     "compensated": "**Rates:** measured rate in grey, and rate without the predicted drift in colour.",
     "drift/g.": "**Drift:** means at rest in colour, prediction in grey, and its 95 % interval in thin lines.",
     "innovation/g.": "**Innovation:** differences of the means from their predictions, mostly within ±2 σ.",
-    "drift": "**Drift models:** model and predicted drift of each gyroscope.",
+    "drift": "**Drift models:** predicted drift of each gyroscope, and its ARMA model with the coefficients φ and θ.",
 }
 """Sentence that describes each kind of panel; the keys are regular expressions for the end of the path of its view."""
 

@@ -37,7 +37,11 @@ CONFIRM_PERIOD_S: Final = 1.0  # interval between two checks that the viewer has
 PATIENCE_S: Final = 1.0  # longest duration of such a check
 STALL_TIMEOUT_S: Final = 2.0  # a Rerun call that takes longer shows that the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-LAYOUT_PERIOD_S: Final = 2.0  # shortest interval between two layouts, because a new layout selects the first page
+LAYOUT_PERIODS_S: Final = (2.0, 10.0)
+"""Shortest interval before the second layout and before each further layout [s].
+
+A new layout selects the first page. A viewer that joins late receives all layouts before the newest results.
+"""
 PLOTS_PER_S: Final = 8.0  # number of Allan plots of all devices that are drawn per second
 MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes earlier does not work on this machine
 MISSING: Final = f"rerun-sdk is not installed: {install_command('imu-monitor[viewer]')}"
@@ -210,6 +214,7 @@ class RerunView:
         begun: set[str] = set()
         views: list[tuple[str, str]] | None = None  # views of the layout that was sent last
         laid_out_entities: set[str] = set()  # entities with data when the layout was checked last
+        layouts = 0  # number of layouts that were sent for the present devices
         checked = laid_out = time.monotonic()
         while True:
             closing = self._closing.is_set()
@@ -221,15 +226,17 @@ class RerunView:
                 shown = self._devices
                 waiting.period_factor = max(1.0, len(shown) / PLOTS_PER_S)
                 scene.set_detailed_devices(shown)
-                views = None
+                views, layouts = None, 0
                 self._phase = f"ok, but {output.note}" if output.note else "ok"
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
             waiting.draw_due_results(scene, draw_all=closing)
             now = time.monotonic()
-            if views is None or (now - laid_out > LAYOUT_PERIOD_S and scene.entities != laid_out_entities):
-                views = self._send_layout_if_changed(output, scene, shown, views)
+            period_s = LAYOUT_PERIODS_S[min(layouts, len(LAYOUT_PERIODS_S)) - 1]
+            if views is None or (now - laid_out > period_s and scene.entities != laid_out_entities):
+                sent, views = views, self._send_layout_if_changed(output, scene, shown, views)
+                layouts += views != sent
                 laid_out, laid_out_entities = now, set(scene.entities)
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)

@@ -4,8 +4,10 @@ Only the viewer thread may use this module, because calls block while the viewer
 imports Rerun.
 """
 
+import time
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import rerun as rr
@@ -25,6 +27,21 @@ PANELS: tuple[type[Panel], ...] = tuple(
     getattr(panels, drawing.panel) for kind in RESULT_KINDS for drawing in kind.drawings
 )
 """Classes of all panels."""
+REPEAT_PERIOD_S: Final = 10.0
+"""Interval at which unchanged entities are logged again [s].
+
+A viewer that joins late receives the newest messages first, and the oldest messages may have been dropped. Each
+repetition of the entities of one device takes about 100 kB.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _LoggedEntity:
+    """Newest content of an entity that is not static."""
+
+    unix_s: float  # Unix time under which the content was logged [s]
+    logged_s: float  # monotonic time of the logging call [s]
+    components: tuple[Any, ...]
 
 
 class AllDevicesScene:
@@ -48,6 +65,9 @@ class AllDevicesScene:
         self.entities: set[str] = set()  # paths of the entities that have data
         self._stream = stream
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
+        self._static_texts: dict[str, str] = {}  # newest static text of each path
+        self._log_time_s = 0.0  # Unix time of the following calls [s]
+        self._newest: dict[str, _LoggedEntity] = {}  # newest content of each path
 
     def set_detailed_devices(self, devices: Sequence[ViewerDeviceDescription]) -> None:
         """Set the devices that have panels."""
@@ -102,8 +122,25 @@ class AllDevicesScene:
         for kind in PANELS:
             self.get_or_create_panel(device, kind).draw_history(history)
 
+    def repeat_unchanged_entities(self, folder: str, unix_s: float) -> None:
+        """Log entities again whose newest content is older than REPEAT_PERIOD_S.
+
+        Parameters
+        ----------
+        folder
+            Beginning of the paths of the entities, such as the name of a device.
+        unix_s
+            Unix time under which the content is logged, unless its own time is later [s].
+        """
+        oldest_s = time.monotonic() - REPEAT_PERIOD_S
+        for path, newest in list(self._newest.items()):
+            if path.startswith(f"{folder}/") and newest.logged_s <= oldest_s:
+                self.set_log_time(max(unix_s, newest.unix_s))
+                self.log(path, *newest.components)
+
     def set_log_time(self, unix_s: float) -> None:
         """Set the Unix time [s] under which the following calls log their data."""
+        self._log_time_s = unix_s
         self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([unix_s]))[0])
 
     def log(self, path: str, *entities: Any, static: bool = False) -> None:
@@ -120,10 +157,13 @@ class AllDevicesScene:
         """
         if not static:
             self.entities.add(f"/{path}")
+            self._newest[path] = _LoggedEntity(self._log_time_s, time.monotonic(), entities)
         self._stream.log(path, *entities, static=static)
 
     def log_static_text(self, path: str, text: str) -> None:
-        """Log a Markdown text that does not change with time.
+        """Log a Markdown text that does not change with time, unless the viewer already has this text.
+
+        A viewer that joins late receives all static texts before the newest results.
 
         Parameters
         ----------
@@ -132,7 +172,9 @@ class AllDevicesScene:
         text
             Text in Markdown.
         """
-        self._stream.log(path, markdown_document(text), static=True)
+        if self._static_texts.get(path) != text:
+            self._static_texts[path] = text
+            self._stream.log(path, markdown_document(text), static=True)
         self.entities.add(path if path.startswith("/") else f"/{path}")
 
     def log_scalars(self, path: str, unix_s: Floats, values: Floats) -> None:

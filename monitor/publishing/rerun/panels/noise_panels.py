@@ -82,10 +82,6 @@ class CoefficientsPanel(Panel):
                 unit = self.scene.units.single(sensor_kind(axis), symbol).name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
                 self._style_lines(f"coefficients/{symbol}/{axis}", [*lines, (f"{axis} 95 % high", dim, 0.75)])
-                mark = rr.SeriesPoints(
-                    colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"]
-                )
-                self.scene.log(self.entity_path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
         """Draw the noise coefficients of all given estimates."""
@@ -104,6 +100,27 @@ class CoefficientsPanel(Panel):
                 if np.isfinite(value.last).any():
                     at, values = history_points.history_points(history, value, lo.last, hi.last)
                     self.log_coefficient(symbol, axis, at, values)
+
+    def mark_change(self, symbol: str, axis: str, unix_s: float, value: float) -> None:
+        """Mark the new value of a changed coefficient with a diamond.
+
+        Parameters
+        ----------
+        symbol
+            Symbol of the coefficient: Q, N, B, K or R.
+        axis
+            Name of the axis.
+        unix_s
+            Unix time of the change [s].
+        value
+            New value of the coefficient in SI units.
+        """
+        path = self.entity_path(f"coefficients/{symbol}/{axis}/changed")
+        if f"/{path}" not in self.scene.entities:
+            colour = axis_colours.AXIS_COLOURS[axis]
+            mark = rr.SeriesPoints(colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"])
+            self.scene.log(path, mark, static=True)
+        self.log_coefficient(symbol, axis, np.array([unix_s]), np.array([value]), "/changed")
 
     def log_coefficient(self, symbol: str, axis: str, unix_s: Floats, values: Floats, name: str = "") -> None:
         """Log a noise coefficient over time.

@@ -38,6 +38,7 @@ class HealthPanel(Panel):
             return
         self.scene.entities.discard(f"/{self.entity_path('waiting')}")
         self._log_text("status", at_s, text)
+        self.scene.repeat_unchanged_entities(self.device, at_s)
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.get_or_create_panel("", AllDevicesTablePanel).log_table_of_all_devices(
                 at_s, overview_text(self.scene.healths)
@@ -63,6 +64,7 @@ class AllDevicesTablePanel(Panel):
         """
         self.scene.set_log_time(unix_s)
         self.scene.log("overview", markdown_document(text))
+        self.scene.repeat_unchanged_entities("overview", unix_s)
 
 
 MAX_SHOWN_EVENTS: Final = 100
@@ -133,5 +135,4 @@ class EventsPanel(Panel):
         coefficients = self.scene.get_or_create_panel(self.device, CoefficientsPanel)
         for symbol, sides in event.values.items():
             if symbol in SYMBOLS and "after" in sides:
-                at, after = np.array([unix_s]), np.array([sides["after"]])
-                coefficients.log_coefficient(symbol, event.axis, at, after, "/changed")
+                coefficients.mark_change(symbol, event.axis, unix_s, sides["after"])

@@ -132,7 +132,7 @@ def test_layout_shows_the_state_once_its_time_is_known(monkeypatch: pytest.Monke
 
     build_layout = blueprint.blueprint
     monkeypatch.setattr(blueprint, "blueprint", build)
-    monkeypatch.setattr(rerun_view, "LAYOUT_PERIOD_S", 0.0)
+    monkeypatch.setattr(rerun_view, "LAYOUT_PERIODS_S", (0.0,))
     view = RerunView(ViewerSettings(mode=str(tmp_path / "run.rrd")), DEVICE)
     view.start()
     for at_s, entity in ((np.nan, "/bench-1/waiting"), (T0, "/bench-1/status")):
