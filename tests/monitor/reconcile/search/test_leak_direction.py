@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effects import CrossAxis
+from monitor.noise.effects import BandwidthLimit, CrossAxis, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes
 from monitor.reconcile.reconcile import reconcile
@@ -58,3 +58,26 @@ def test_leak_of_the_model_is_no_leak_in_the_opposite_direction():
     found = reconcile_leak(model, 0.05, 1)
     assert ("gy", "added", "cross_axis") not in list_steps(found)
     assert found.axes["gy"].steps
+
+
+def test_new_leak_beside_a_leak_of_the_model_in_the_opposite_direction():
+    """The spectra differ, so the leak of the model is not resized to explain the new leak."""
+    known, hidden, rng = 0.05, 0.2, np.random.default_rng(4)
+    own_gx = white(n, rng)
+    gy = white(n, rng) + walk(n, rng, 20.0 * WALK.K) + known * own_gx
+    model = NoiseModel(
+        {"gx": (WHITE,), "gy": (WHITE, RateRandomWalk(K=20.0 * WALK.K), CrossAxis(source="gx", coefficient=known))}
+    )
+    found = reconcile(RecordedAxes({"gx": own_gx + hidden * (gy - known * own_gx), "gy": gy}, RATE_HZ, None), model, 1)
+    assert ("gx", "added", "cross_axis") in list_steps(found)
+    assert ("gy", "retuned", "cross_axis") not in list_steps(found)
+
+
+def test_leak_of_a_filtered_axis_agrees_with_its_simulation():
+    leak, filtered = CrossAxis(source="gy", coefficient=0.2), BandwidthLimit(cutoff=10.0, order=2)
+    model = NoiseModel({"gx": (WHITE, leak, filtered), "gy": (WHITE, BandwidthLimit(cutoff=30.0))})
+    drawn = model.simulate(n, RATE_HZ, 5)
+    recorded = RecordedAxes({"gx": drawn[:, 0].copy(), "gy": drawn[:, 1].copy()}, RATE_HZ, None)
+    found = reconcile(recorded, model, 1)
+    assert found.verdict == "agrees"
+    assert max(gap.threshold for gap in found.axes["gx"].start.gaps if gap.diagnostic == "other_axes") < 6.0

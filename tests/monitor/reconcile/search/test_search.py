@@ -321,6 +321,16 @@ def test_moved_line_of_the_model_is_no_new_line(known, new_hz):
     assert not any(one.gain > STRICT[diagnostic].threshold for diagnostic, one in found.final.findings.items())
 
 
+@pytest.mark.parametrize("cycles", [0.7, 1.0, 1.3, 2.0, 5.0])
+def test_line_of_the_model_that_moved_by_a_few_cycles_is_no_new_line(cycles):
+    hz = 7.3 + cycles * RATE_HZ / n
+    y = draw_noise(3) + 3e-4 * np.sin(2.0 * np.pi * hz * T + 1.0)
+    found = search_axis(y, (*MODEL, Sinusoidal(amplitude=3e-4, frequency=7.3)))
+    assert list_added(found) == []
+    assert [one.trials[0].moved for one in found.rounds] == [len(MODEL)]
+    assert found.hypothesis.effects[-1].frequency == pytest.approx(hz, abs=0.03 * RATE_HZ / n)
+
+
 @pytest.mark.parametrize(("cutoff_hz", "order"), [(12.0, 1), (40.0, 1), (20.0, 2)])
 def test_changed_filter_of_the_model_is_no_new_effect(cutoff_hz, order):
     known = BandwidthLimit(cutoff=28.0, order=1, floor=0.1 * N, kind="butterworth")
