@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from types import ModuleType
 from typing import Any, Final, Literal, get_args, get_origin
 
@@ -57,11 +58,8 @@ def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
         Bytes of a serial port in their original order. 4 kB are enough for most formats.
     """
     found: list[IdentifiedFormat] = []
-    for name in module_lookup.list_modules(decoders):
-        if name == TEXT_DECODER:
-            continue
-        module = module_lookup.import_module(decoders, name)
-        for options in _list_option_sets(module.Settings):
+    for name, module, option_sets in _list_decoders():
+        for options in option_sets:
             result = _decode(name, module, options, data)
             if result is not None and result.samples >= MIN_SAMPLES:
                 found.append(result)
@@ -69,6 +67,14 @@ def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
     if not found:
         return _identify_text_lines(data)
     return max(found, key=lambda one: (one.samples, -one.bad))
+
+
+@cache
+def _list_decoders() -> tuple[tuple[str, ModuleType, tuple[dict[str, Any], ...]], ...]:
+    """Return name, module and option sets of every decoder except that of text lines."""
+    names = (name for name in module_lookup.list_modules(decoders) if name != TEXT_DECODER)
+    modules = ((name, module_lookup.import_module(decoders, name)) for name in names)
+    return tuple((name, module, tuple(_list_option_sets(module.Settings))) for name, module in modules)
 
 
 def _list_option_sets(settings: type[SettingsModel]) -> Iterator[dict[str, Any]]:

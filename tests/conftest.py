@@ -27,6 +27,14 @@ MAX_WORKERS: Final = 12
 LONG_FOLDERS: Final = {"benchmarks", "blind", "fuzz", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 
+SLOWEST_TESTS: Final = (
+    "test_warm_up_compiles_every_kernel_once_and_leaves_nothing_to_compile",
+    "test_at_most_one_of_a_thousand_recordings_of_the_model_has_a_finding",
+    "test_commands_of_tutorial_print_what_it_shows",
+    "test_wandering_lines_are_named",
+)
+"""Tests that run first. Otherwise, one worker could run one of them alone at the end."""
+
 # By default, Hypothesis limits the elapsed time of each example to 200 ms. A loaded machine exceeds this limit.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
@@ -60,7 +68,11 @@ def _ignore_line(_line: str) -> None: ...
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of ``LONG_FOLDERS`` as long, before the tests are selected by their markers."""
+    """Put the slowest tests first, and mark the tests of ``LONG_FOLDERS`` as long before tests are selected by markers.
+
+    pytest-randomly has shuffled the tests before.
+    """
+    items.sort(key=lambda item: not item.name.startswith(SLOWEST_TESTS))
     for item in items:
         if LONG_FOLDERS & {folder.name for folder in item.path.relative_to(item.config.rootpath).parents}:
             item.add_marker("long")

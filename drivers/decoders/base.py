@@ -9,6 +9,7 @@ each mistake. Each line of the ``ConfigError`` begins with the configuration key
 counted in ``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.
 """
 
+import re
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -317,10 +318,14 @@ class FrameBuffer:
         Function that checks one candidate frame.
     longest
         Maximum length of a frame in bytes.
+    first_bytes
+        All bytes that a frame can start with, if ``sync`` is empty. The buffer then rejects every other byte without a
+        call of ``match``.
     """
 
-    def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
+    def __init__(self, sync: bytes, match: FrameMatcher, longest: int, first_bytes: bytes = b"") -> None:
         self.sync = self._initial_sync = sync
+        self._first_byte = re.compile(b"[%b]" % re.escape(first_bytes)) if first_bytes else None
         self._match = match
         self._longest = longest
         self._buffer = b""
@@ -359,15 +364,15 @@ class FrameBuffer:
         while at < len(buffer):
             # Usually, the next frame follows without a gap.
             start, length = at, self._match(buffer, at) if buffer.startswith(self.sync, at) else NEED_MORE
-            if length <= 0:
+            if length == NEED_MORE or (length == REJECT and self.sync != self._initial_sync):
                 start, length = self._examine_candidate(buffer, at)
             at = start + max(length, 0)
             if length == NEED_MORE:
                 break
             if length == REJECT:
-                self._count_rejected(start)
-                self._skipped_bytes += 1
-                at = start + 1
+                at = self._find_first_byte(buffer, start + 1)
+                self._count_rejected(start, at)
+                self._skipped_bytes += at - start
                 continue
             found.append(buffer[start:at])
             while self._arrivals[0][0] < self._buffer_offset + at:
@@ -415,12 +420,22 @@ class FrameBuffer:
                 self._arrivals.append((end, chunk.t_ns))
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
-    def _count_rejected(self, at: int) -> None:
-        """Count a rejected candidate frame. Candidates less than one frame length apart are counted once."""
-        offset = self._buffer_offset + at
-        if offset - self._last_rejected >= max(self._frame_length, 1):
-            self._rejected += 1
-            self._last_rejected = offset
+    def _find_first_byte(self, buffer: bytes, at: int) -> int:
+        """Return the offset of the next byte that a frame can start with, at the earliest ``at``."""
+        if self._first_byte is None or self.sync:
+            return at
+        first = self._first_byte.search(buffer, at)
+        return len(buffer) if first is None else first.start()
+
+    def _count_rejected(self, at: int, end: int) -> None:
+        """Count the rejected candidates before ``end``. Candidates closer than one frame length are counted once."""
+        step = max(self._frame_length, 1)
+        first = max(self._buffer_offset + at, self._last_rejected + step)
+        last = self._buffer_offset + end - 1
+        if first <= last:
+            further = (last - first) // step
+            self._rejected += 1 + further
+            self._last_rejected = first + further * step
 
     def _take_lost_frames(self) -> int:
         """Return the number of frames lost since the last valid frame, and reset the number to 0."""
@@ -460,9 +475,9 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
 
     carrier: ClassVar[str] = "bytes"
 
-    def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
+    def __init__(self, sync: bytes, match: FrameMatcher, longest: int, first_bytes: bytes = b"") -> None:
         super().__init__()
-        self._buffer = FrameBuffer(sync, match, longest)
+        self._buffer = FrameBuffer(sync, match, longest, first_bytes)
         self._frames_without_sample = 0  # number of valid frames since the last frame with a sample
 
     @property

@@ -206,6 +206,9 @@ def split_by_arrival_time(samples: SampleBlock, origin_ns: int) -> Iterator[Samp
         Arrival time of the first sample of the device in ns.
     """
     t_ns = samples.t_ns
+    if (t_ns == t_ns[:1]).all():  # usually, the samples of a chunk arrive together
+        yield samples
+        return
     batch = np.where(t_ns - origin_ns < SINGLE_NS, t_ns, t_ns // BATCH_NS)
     edges = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(samples)]
     for first, last in pairwise(edges):

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 _masked = "scipy" not in sys.modules
 if _masked:
@@ -183,6 +184,20 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
         # Numba compares the version before reading the index, which may refer to types that no longer exist
         kept._version = f"{kept._version} {hash_module_with_imports(Path(inspect.getfile(function)))}"  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
+
+
+def as_read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a read-only view.
+
+    Numba compiles a kernel separately for writable and for read-only arrays, such as the columns of a file. A kernel
+    that gets only read-only views is compiled once.
+
+    >>> as_read_only(np.zeros(2)).flags.writeable
+    False
+    """
+    view = values.view()
+    view.flags.writeable = False
+    return view
 
 
 def without_reference_count(array: A) -> A:

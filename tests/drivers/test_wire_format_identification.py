@@ -37,18 +37,17 @@ def read_at_wrong_baud_rate(data: bytes, baud_ratio: float) -> bytes:
     ``baud_ratio`` is the sender's baud rate divided by the reader's.
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")
-    line = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)]).ravel()
-    line = np.concatenate([line, np.ones(64, np.uint8)])
-    at, read = 0.0, bytearray()
-    while at + 10 * baud_ratio < line.size:
-        if line[int(at)]:  # the line is idle
-            at += baud_ratio / 16
-            continue
-        samples = line[(at + baud_ratio * (np.arange(1, 10) + 0.5)).astype(int)]
-        if samples[8]:
-            read.append(int(np.packbits(samples[:8], bitorder="little")[0]))
-        at += baud_ratio * 9.75
-    return bytes(read)
+    sent = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)]).ravel()
+    sent = np.concatenate([sent, np.ones(64, np.uint8)])
+    times = np.arange(0.0, sent.size, baud_ratio / 16)  # the reader samples 16 times a bit
+    line = sent[times.astype(np.int64)].tobytes()
+    read = []
+    at = line.find(0)
+    while 0 <= at < len(line) - 160:
+        if line[at + 152]:  # the stop bit
+            read.append(line[at + 24 : at + 152 : 16])  # the centres of the bits
+        at = line.find(0, at + 156)
+    return np.packbits(np.frombuffer(b"".join(read), np.uint8), bitorder="little").tobytes()
 
 
 @pytest.mark.parametrize("example", STREAMS, ids=str)

@@ -75,7 +75,7 @@ class Bno055Decoder(base.FrameStreamDecoder):
     timing: Timing = ArrivalTimedFormat()
 
     def __init__(self) -> None:
-        super().__init__(b"", _match_answer, MAX_ERROR_BYTES + LENGTH)
+        super().__init__(b"", _match_answer, MAX_ERROR_BYTES + LENGTH, ERROR + HEADER[:1])
         self._missed = 0  # number of read requests that were answered with an error
         self._last_error = 0  # code of the last error answer; 0 if an answer with registers followed
         self._status = self._system_error = 0

@@ -131,7 +131,7 @@ class MavlinkDecoder(base.FrameStreamDecoder):
     """Decoder of MAVLink 1 and 2 frames, and encoder of MAVLink 2 frames."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(b"", self._match_frame, LONGEST)
+        super().__init__(b"", self._match_frame, LONGEST, bytes(HEADER_BYTES))
         self._settings = settings
         self._message = message = MESSAGES[settings.message]
         self._has_instance = "instance" in (message.layout.names or ())

@@ -104,7 +104,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
 
     def __init__(self, settings: Settings) -> None:
         wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
-        super().__init__(wanted, self._match_datagram, LONGEST)
+        super().__init__(wanted, self._match_datagram, LONGEST, bytes(SIZES))
         self._settings = settings
         self.timing: Timing = CounterTimedFormat(256, 1.0 / 2000.0)
         rate = settings.rate or 1.0

@@ -80,7 +80,7 @@ class UbloxEsfDecoder(base.FrameStreamDecoder):
     """Decoder and encoder of ESF-RAW and ESF-MEAS messages."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(b"", _match_message, LONGEST)
+        super().__init__(b"", _match_message, LONGEST, SYNC[:1] + b"$")
         self._name = settings.message
         self._modulus = MODULI[settings.message]
         tick_s = 1e-3 if settings.message == "esf-meas" else settings.tick

@@ -14,7 +14,7 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import student_quantile
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_fit import whiten_regression
+from monitor.drift.thermal.thermal_fit import Whitening
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
@@ -72,7 +72,8 @@ class RecursiveThermalFit:
         self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
         self._row, self._bias = rows[-1], float(means.bias[-1]) if means.both_known[-1] else np.nan
-        white, z, _ = whiten_regression(rows, np.where(means.both_known, means.bias, 0.0), means.both_known, model.phi)
+        whitening = Whitening(means.both_known, model.phi)
+        white, z = whitening.whiten(rows), whitening.whiten(np.where(means.both_known, means.bias, 0.0))
         self._triangle = _upper_triangle(np.hstack([white, z[:, None]]))
         self._count = int(means.both_known.sum())
         self.model = self._with_current_coefficients(

@@ -15,6 +15,7 @@ changes. The constant term and the use of predicted values extend that method.
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from math import log
 from typing import Final, TypeVar
@@ -260,7 +261,8 @@ def _fit_shape(
 class _TimeConstantSearch:
     """Search for the best time constants of a model form at a given residual correlation φ.
 
-    The time constants are selected one by one from a grid, and then refined by golden-section search.
+    The time constants are selected one by one from a grid, and then refined by golden-section search. Two successive
+    evaluations differ in one time constant, so the whitened regressors of the others are kept.
     """
 
     def __init__(
@@ -271,6 +273,11 @@ class _TimeConstantSearch:
         self._slowest = MAX_TIME_CONSTANT_SHARE * means.interval_s * excess.size
         self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
         self._constants: tuple[float, ...] = ()
+        self._whitening = Whitening(means.both_known, phi)
+        self._values = self._whitening.whiten(np.where(means.both_known, means.bias, 0.0))
+        self._fixed = self._whiten_columns(replace(shape, constants_s=()))
+        self._step = [] if since is None else [self._whitening.whiten(_step_column(excess.size, since))]
+        self._lag_columns = lru_cache(MAX_LAGS + 1)(self._whiten_lag_columns)
 
     def find_best_time_constants(self) -> StepwiseWork[_ShapeFit]:
         """Find the best time constants, and return the fit."""
@@ -280,12 +287,27 @@ class _TimeConstantSearch:
         for _ in range(2 if k > 1 else min(k, 1)):
             for at in range(k):
                 yield from self._refine(at)
-        return (yield from self._evaluate(self._constants))
-
-    def _evaluate(self, constants: tuple[float, ...]) -> StepwiseWork[_ShapeFit]:
         yield
-        shape = replace(self._shape, constants_s=tuple(sorted(constants)))
+        shape = replace(self._shape, constants_s=tuple(sorted(self._constants)))
         return _fit_sizes(self._means, self._excess, shape, self._phi, self._since)
+
+    def _whiten_columns(self, shape: ThermalModelForm) -> list[Floats]:
+        columns = build_regressors(shape, self._excess, self._means.interval_s, with_initial_state=True)
+        return [self._whitening.whiten(column) for column in columns.T]
+
+    def _whiten_lag_columns(self, constant: float) -> tuple[Floats, Floats]:
+        """Return the whitened lag of a time constant, and the whitened response to its initial state."""
+        _, lag, initial = self._whiten_columns(ThermalModelForm(0, (constant,)))
+        return lag, initial
+
+    def _evaluate(self, constants: tuple[float, ...]) -> StepwiseWork[float]:
+        """Return the AICc of a fit."""
+        yield
+        lags, initials = zip(*map(self._lag_columns, sorted(constants)), strict=True)
+        x = np.stack([*self._fixed, *lags, *initials, *self._step], axis=1)
+        sizes = solve_least_squares(x, self._values)
+        free = sizes.size + len(constants) + (self._phi > 0.0) + 1
+        return _compute_aicc(_residual_square(x, self._values, sizes), free, self._phi, self._whitening)
 
     def _add_from_grid(self) -> StepwiseWork[None]:
         """Add the best time constant on the grid that differs from the others by MIN_TIME_CONSTANT_RATIO or more."""
@@ -296,16 +318,24 @@ class _TimeConstantSearch:
         ]
         scores = []
         for one in free:
-            scores.append((yield from self._evaluate((*self._constants, one))).aicc)
+            scores.append((yield from self._evaluate((*self._constants, one))))
         self._constants = (*self._constants, free[int(np.argmin(scores))])
 
     def _refine(self, at: int) -> StepwiseWork[None]:
         lo, hi = self._bounds(at)
-        for _ in range(GOLDEN_STEPS):
-            a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
-            below = yield from self._evaluate(self._replaced(at, a))
-            above = yield from self._evaluate(self._replaced(at, b))
-            lo, hi = (lo, b) if below.aicc < above.aicc else (a, hi)
+        a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
+        below = yield from self._evaluate(self._replaced(at, a))
+        above = yield from self._evaluate(self._replaced(at, b))
+        for _ in range(GOLDEN_STEPS - 1):
+            if below < above:
+                hi, b, above = b, a, below
+                a = hi * (lo / hi) ** GOLDEN_RATIO
+                below = yield from self._evaluate(self._replaced(at, a))
+            else:
+                lo, a, below = a, b, above
+                b = lo * (hi / lo) ** GOLDEN_RATIO
+                above = yield from self._evaluate(self._replaced(at, b))
+        lo, hi = (lo, b) if below < above else (a, hi)
         self._constants = self._replaced(at, (lo * hi) ** 0.5)
 
     def _replaced(self, at: int, constant: float) -> tuple[float, ...]:
@@ -328,19 +358,33 @@ def _fit_sizes(
     columns = build_regressors(shape, excess, means.interval_s, with_initial_state=True)
     own = columns.shape[1]
     if since is not None:
-        columns = np.hstack([columns, (np.arange(excess.size) >= since)[:, None]])
+        columns = np.hstack([columns, _step_column(excess.size, since)[:, None]])
     y = np.where(known, means.bias, 0.0)
-    x, z, fresh = whiten_regression(columns, y, known, phi)
+    whitening = Whitening(known, phi)
+    x, z = whitening.whiten(columns), whitening.whiten(y)
     sizes = solve_least_squares(x, z)
-    count = x.shape[0]
-    square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
+    square = _residual_square(x, z, sizes)
     free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
-    likelihood = count * log(square / count) - fresh * log(1.0 - phi**2)
-    aicc = likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
     rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
-    sigma = (square / max(count - free + 1, 1)) ** 0.5
+    sigma = (square / max(len(z) - free + 1, 1)) ** 0.5
     step = 0.0 if since is None else float(sizes[own])
+    aicc = _compute_aicc(square, free, phi, whitening)
     return _ShapeFit(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
+
+
+def _step_column(n: int, since: int) -> Floats:
+    return (np.arange(n) >= since).astype(np.float64)
+
+
+def _residual_square(x: Floats, z: Floats, sizes: Floats) -> float:
+    return max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
+
+
+def _compute_aicc(square: float, free: int, phi: float, whitening: "Whitening") -> float:
+    """Return the AICc of a fit with ``free`` parameters and the sum of squares of the whitened residuals."""
+    count = whitening.known_count
+    likelihood = count * log(square / count) - whitening.fresh_count * log(1.0 - phi**2)
+    return likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
 
 
 def _without_step(means: IntervalMeans, since: int | None, step: float) -> IntervalMeans:
@@ -349,40 +393,36 @@ def _without_step(means: IntervalMeans, since: int | None, step: float) -> Inter
     return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
 
 
-def whiten_regression(regressors: Floats, values: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
-    """Whiten regressors and values whose residuals have the correlation φ.
+class Whitening:
+    """Filter that whitens residuals with the correlation φ between successive intervals.
 
     From each row, φ times the previous row is subtracted. If the previous row is unknown, the row is scaled instead, so
     that its residual has the same variance.
 
     Parameters
     ----------
-    regressors : ndarray, shape (n, m)
-        Regressors of the model form.
-    values : ndarray, shape (n,)
-        Values to which the regressors are fitted, in rad/s or m/s².
     known : ndarray, shape (n,), bool
         True where the value is known.
     phi : float
         Correlation between successive residuals.
-
-    Returns
-    -------
-    regressors : ndarray, shape (known, m)
-        Whitened regressors of the rows with known values.
-    values : ndarray, shape (known,)
-        Whitened values.
-    fresh : int
-        Number of known rows whose previous row is unknown.
     """
-    follows = known[1:] & known[:-1]
-    x, z = regressors.copy(), values.copy()
-    x[1:] -= phi * follows[:, None] * regressors[:-1]
-    z[1:] -= phi * follows * values[:-1]
-    first = known.copy()
-    first[1:] &= ~follows
-    weight = np.where(first, (1.0 - phi**2) ** 0.5, 1.0)
-    return (x * weight[:, None])[known], (z * weight)[known], int(first.sum())
+
+    def __init__(self, known: np.ndarray, phi: float) -> None:
+        follows = known[1:] & known[:-1]
+        first = known.copy()
+        first[1:] &= ~follows
+        self._known = known
+        self._previous_weight = phi * follows
+        self._weight = np.where(first, (1.0 - phi**2) ** 0.5, 1.0)
+        self.known_count = int(known.sum())  # number of rows with known values
+        self.fresh_count = int(first.sum())  # number of known rows whose previous row is unknown
+
+    def whiten(self, rows: Floats) -> Floats:
+        """Whiten regressors [n, m] or values [n], and return the rows with known values."""
+        columns = rows.T
+        whitened = columns.copy()
+        whitened[..., 1:] -= self._previous_weight * columns[..., :-1]
+        return np.asarray(np.ascontiguousarray((whitened * self._weight).T)[self._known])
 
 
 def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
@@ -397,7 +437,8 @@ def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit)
         used = means.both_known.copy()
         used[lo:hi] = False
         columns = one.columns if lo else build_regressors(one.shape, excess, means.interval_s)
-        x, z, _ = whiten_regression(columns, np.where(used, means.bias, 0.0), used, one.phi)
+        whitening = Whitening(used, one.phi)
+        x, z = whitening.whiten(columns), whitening.whiten(np.where(used, means.bias, 0.0))
         differences = (means.bias - columns @ solve_least_squares(x, z))[lo:hi]
         square += float((differences[means.both_known[lo:hi]] ** 2).sum())
     return float((square / means.both_known.sum()) ** 0.5)
@@ -420,5 +461,5 @@ def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _Sh
         highest_c=float(np.nanmax(means.temperature_c)),
     )
     rows = np.hstack([one.columns, bias_derivatives_by_log_time_constant(model, excess, one.sizes)])
-    x, _, _ = whiten_regression(rows, np.zeros(excess.size), means.both_known, one.phi)
+    x = Whitening(means.both_known, one.phi).whiten(rows)
     return replace(model, covariance=coefficient_covariance(x, one.sigma))

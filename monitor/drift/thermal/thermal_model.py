@@ -177,7 +177,7 @@ def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> 
     Parameters
     ----------
     whitened_regressors : ndarray, shape (n, m)
-        Whitened regressors, as returned by ``whiten_regression``.
+        Whitened regressors, as returned by ``Whitening.whiten``.
     residual_std : float
         Standard deviation of the whitened residuals.
     """

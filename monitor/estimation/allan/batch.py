@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
-from monitor.common.compiled import compiled
+from monitor.common.compiled import as_read_only, compiled
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
 """Averaging times: the name of a predefined grid, or a tuple of times in seconds."""
@@ -114,7 +114,7 @@ def rate_slope_from_thirds(values: Floats) -> Floats:
     third = len(values) // 3
     if third == 0:
         return np.full(values.shape[1], np.nan)
-    newest = np.ascontiguousarray(values[len(values) - 3 * third :], np.float64)
+    newest = as_read_only(np.ascontiguousarray(values[len(values) - 3 * third :], np.float64))
     parts = [_mean(newest[part * third : (part + 1) * third]) for part in range(3)]
     counts = np.stack([count for count, _ in parts])
     whole = (counts.sum(axis=0) >= MIN_PRESENT_SHARE * 3 * third) & (counts[::2] >= MIN_PRESENT_SHARE * third).all(
@@ -145,7 +145,7 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     [0.5, 0.5]
     """
     m = np.asarray(factors, np.int64)
-    rates = np.ascontiguousarray(rates, np.float64)
+    rates = as_read_only(np.ascontiguousarray(rates, np.float64))
     terms = len(rates) + 1 - 2 * m
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)

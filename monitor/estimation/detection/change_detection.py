@@ -31,6 +31,7 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.validation.number_ranges import DAY_S
+from monitor.common.compiled import as_read_only
 from monitor.common.unit_formatting import COEFFICIENT_NAMES, format_axis_value, sensor_kind
 from monitor.estimation.detection.change_kernel import (
     AFTER,
@@ -178,7 +179,7 @@ class NoiseAndBiasChangeDetector:
         ValueError
             If ``values`` does not have six columns.
         """
-        rows = np.ascontiguousarray(values, np.float64)
+        rows = as_read_only(np.ascontiguousarray(values, np.float64))
         if rows.ndim != 2 or rows.shape[1] != len(AXES):
             raise ValueError(f"samples of shape {rows.shape}; expected is [n, {len(AXES)}]")
         row = 0

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled
+from monitor.common.compiled import as_read_only, compiled
 
 ROWS: Final = 1000
 """Number of samples in a segment, during which the noise is assumed to be constant."""
@@ -39,7 +39,7 @@ def estimate_stale_sample_share(values: Floats) -> float:
     begins = np.linspace(0, max(len(values) - ROWS, 0), min(-(-len(values) // ROWS), MAX_STRETCHES)).astype(np.int64)
     pairs, whole = np.zeros(begins.size, np.int64), np.zeros(begins.size, np.int64)
     repeats = np.zeros((begins.size, values.shape[1]), np.int64)
-    _count(values, there, begins, pairs, repeats, whole)
+    _count(as_read_only(values), there, begins, pairs, repeats, whole)
     some = pairs > 0
     if not some.any():
         return 0.0

@@ -48,6 +48,22 @@ def test_result_does_not_depend_on_the_division_into_chunks(cuts: list[int], noi
     assert find_frames(data, tuple(range(len(data)))) == find_frames(data)
 
 
+@given(st.lists(st.integers(0, 230)), st.lists(st.binary(max_size=12), min_size=4, max_size=4))
+def test_first_bytes_do_not_change_the_result(cuts: list[int], noise: list[bytes]) -> None:
+    def match(buffer: bytes, at: int) -> int:
+        return match_frame(buffer, at) if buffer[at] == 0xAA else REJECT
+
+    data = b"".join(n + b"".join(FRAMES[10 * i : 10 * i + 10]) for i, n in enumerate(noise))
+    edges = [0, *sorted(c for c in cuts if c < len(data)), len(data)]
+    chunks = [Chunk(data[a:b], b) for a, b in itertools.pairwise(edges)]
+    slow, fast = FrameBuffer(b"", match, 5), FrameBuffer(b"", match, 5, first_bytes=b"\xaa")
+    for chunk in chunks:
+        expected, found = slow.feed([chunk]), fast.feed([chunk])
+        assert found.data == expected.data
+        assert found.bad_before.tolist() == expected.bad_before.tolist()
+        assert found.adjacent.tolist() == expected.adjacent.tolist()
+
+
 @pytest.mark.parametrize("at", range(5))
 def test_damaged_byte_loses_only_its_frame(at: int) -> None:
     data = bytearray(b"".join(FRAMES))
