@@ -18,7 +18,7 @@ from monitor.noise.effect import AxisLeak
 from monitor.noise.effects import CrossAxis
 from monitor.reconcile.diagnostics.null_distribution import AxisNull
 from monitor.reconcile.effect_properties import PENALTY_NATS
-from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis
+from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, fit_with_fewest_changes
 from monitor.reconcile.search.search import AxisSearchResult
 from monitor.reconcile.search.trials import Trial
 
@@ -116,9 +116,11 @@ def _describe_leak(hypothesis: Hypothesis, at: int, effect: AxisLeak) -> _Leak:
         return _Leak(effect.source, effect.coefficient, 0.0, hypothesis.fit.size_standard_error(at), gain)
     known = hypothesis.model[at]
     assert isinstance(known, AxisLeak)
-    effects = (*hypothesis.effects[:at], known, *hypothesis.effects[at + 1 :])
-    less = Hypothesis(hypothesis.model, hypothesis.axis.fit(effects, hypothesis.fit.fixed_sizes | {at}))
-    gain = hypothesis.penalised_log_likelihood - less.penalised_log_likelihood
+    gain = 0.0
+    if effect.coefficient != known.coefficient:  # the other sizes may change back
+        axis = replace(hypothesis.axis, sources_of_unchanged_leaks=frozenset({effect.source}))
+        less = fit_with_fewest_changes(axis, hypothesis.added, hypothesis.model)
+        gain = hypothesis.penalised_log_likelihood - less.penalised_log_likelihood
     return _Leak(effect.source, effect.coefficient, known.coefficient, hypothesis.fit.size_standard_error(at), gain)
 
 
