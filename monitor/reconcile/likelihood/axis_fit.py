@@ -164,6 +164,7 @@ class Axis:
     value_artifacts: ValueArtifacts
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
     is_model_fitted: bool = False  # True if the model under test was fitted to this recording
+    is_temperature_coarse: bool = False  # True if the sizes of temperature effects are not compared with the model
     sources_of_unchanged_leaks: frozenset[str] = frozenset()  # sources of leaks of the model whose size is kept
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis

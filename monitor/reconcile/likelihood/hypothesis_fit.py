@@ -22,6 +22,9 @@ from monitor.noise.effects import (
     RandomSampleHold,
     SampleRateError,
     Saturation,
+    TemperatureBias,
+    TemperatureHysteresis,
+    TemperatureLag,
     UnitError,
     VarianceModulation,
     WanderingVariance,
@@ -44,6 +47,7 @@ RESIZE_PENALTY_NATS: Final = 7.0
 If the size in the model is true, the gain exceeds 7 nats by chance with the probability P(χ²₁ > 14) = 0.02 %. A
 recording with six axes has about 24 sizes, so this occurs in about one of 200 recordings.
 """
+TEMPERATURE_EFFECTS: Final = (TemperatureBias, TemperatureHysteresis, TemperatureLag)
 UNMODELLED_TRANSFORMS: Final = (RandomSampleHold, SampleRateError, Saturation, UnitError)
 """Transforms that change deterministic effects in a way that the fit does not describe."""
 STEP_TIME_95_NATS: Final = -log(1.0 - sqrt(0.95))
@@ -244,7 +248,8 @@ def compared_size_indices(axis: Axis, model: Effects) -> frozenset[int]:
     """Return the indices of the effects whose size in the model is compared with the recording.
 
     The sizes of noise effects are always included. The sizes of repeatable deterministic effects are included, unless
-    the model was fitted to the same recording or contains a transform whose effect on them is not modelled.
+    the model was fitted to the same recording or contains a transform whose effect on them is not modelled. If the
+    recorded temperature is coarse, the sizes of temperature effects are not included.
 
     Parameters
     ----------
@@ -255,7 +260,12 @@ def compared_size_indices(axis: Axis, model: Effects) -> frozenset[int]:
     """
     if axis.is_model_fitted or any(isinstance(effect, UNMODELLED_TRANSFORMS) for effect in model):
         return noise_effect_indices(model)
-    return frozenset(at for at, effect in enumerate(model) if is_noise_effect(effect) or is_repeatable_series(effect))
+    fitted = TEMPERATURE_EFFECTS if axis.is_temperature_coarse else ()
+    return frozenset(
+        at
+        for at, effect in enumerate(model)
+        if is_noise_effect(effect) or (is_repeatable_series(effect) and not isinstance(effect, fitted))
+    )
 
 
 def noise_effect_indices(effects: Sequence[Effect]) -> frozenset[int]:

@@ -13,6 +13,11 @@ from monitor.noise.model import NoiseModel
 MIN_SAMPLES: Final = 4096
 """Smallest number of valid samples of an axis."""
 MIN_VALID_FRACTION: Final = 0.5
+MIN_TEMPERATURE_VALUES: Final = 20
+"""Smallest number of different temperatures for a comparison of temperature coefficients.
+
+With fewer values, the rounding of the temperature makes the fitted coefficients too small.
+"""
 TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
 """Length of the moving average of the noisy temperature, as a fraction of the recording.
 """
@@ -25,6 +30,7 @@ class RecordedAxes:
     values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
     rate_hz: float
     temperature_c: Floats | None = None  # [n] °C; NaN = missing
+    is_temperature_coarse: bool = False  # True if the sizes of temperature effects cannot be compared with a model
 
     @property
     def sample_count(self) -> int:
@@ -74,10 +80,13 @@ def select_axes_and_smooth_temperature(
             kept[name] = y
     if not kept:
         raise NotReady("no axis to compare: " + "; ".join(notes))
-    temperature_c = recording.temperature_c
-    if temperature_c is not None:
-        temperature_c = _smooth_temperature(temperature_c) if np.isfinite(temperature_c).any() else None
-    return RecordedAxes(kept, recording.rate_hz, temperature_c), tuple(notes)
+    temperature_c, is_coarse = recording.temperature_c, False
+    if temperature_c is not None and np.isfinite(temperature_c).any():
+        is_coarse = np.unique(temperature_c[np.isfinite(temperature_c)]).size < MIN_TEMPERATURE_VALUES
+        temperature_c = _smooth_temperature(temperature_c)
+    else:
+        temperature_c = None
+    return RecordedAxes(kept, recording.rate_hz, temperature_c, is_coarse), tuple(notes)
 
 
 def _smooth_temperature(temperature_c: Floats) -> Floats:

@@ -292,6 +292,7 @@ def build_repaired_axes(
             recording.temperature_c,
             statistics[name],
             regressors,
+            is_temperature_coarse=recording.is_temperature_coarse,
         )
         axes[name] = _replace_outliers(_subtract_wandering_lines(axis, effects[name], rng), effects[name], rng)
     return axes

@@ -299,6 +299,17 @@ def test_changed_sizes_of_deterministic_effects_are_retuned():
     assert ratios == {(axis,): pytest.approx(factor, rel=0.2) for axis, factor in factors.items()}
 
 
+def test_temperature_in_coarse_steps_is_no_other_coefficient():
+    rng = np.random.default_rng(1)
+    warm = 25.0 + np.cumsum(rng.standard_normal(n)) * 0.005
+    coefficient = TemperatureBias(coefficient=4e-4, reference=25.0)
+    values = {"gx": white(n, rng) + 4e-4 * (warm - 25.0) + 1e-4 * np.sin(2.0 * np.pi * 7.3 * time_s(n))}
+    model = NoiseModel({"gx": (WHITE, coefficient)})
+    found = reconcile(RecordedAxes(values, RATE_HZ, np.round(2.0 * warm) / 2.0), model, 1)
+    assert ("added", "sinusoidal") in [(step.kind, step.effect) for step in found.axes["gx"].steps]
+    assert "temperature_bias" not in [step.effect for step in found.axes["gx"].steps]
+
+
 def test_missing_line_of_the_model_is_absent():
     found = reconcile(recording_with_sizes({"gx": 1.0, "gy": 0.0, "gz": 1.0, "ax": 1.0}), WITH_SIZES, 1)
     assert [(step.kind, step.effect) for step in found.axes["gy"].steps] == [("absent", "sinusoidal")]
