@@ -7,7 +7,6 @@ import signal
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -72,8 +71,8 @@ class Sensors:
 def read_sample_numbers(folder: Path) -> list[int]:
     """Return the numbers of the recorded samples, counted from 0 at the first frame of the sensor."""
     pieces = [piece for path in segment_file.list_segments(folder) for piece in segment_file.read_samples(path)]
-    ticks = np.concatenate([piece.samples.ticks for piece in pieces])
-    return [int(one) for one in (ticks - 1_000_000) // (1_000_000_000 // RATE_HZ)]
+    ticks = [int(tick) for piece in pieces for tick in piece.samples.ticks]
+    return [(tick - 1_000_000) // (1_000_000_000 // RATE_HZ) for tick in ticks]
 
 
 def count_samples(health: Health) -> int:
@@ -100,6 +99,7 @@ def test_killed_worker_is_restarted_while_the_other_continues(tmp_path: Path) ->
         killed, kept = (worker.devices for worker in supervisor._workers)
         sensors = Sensors(terminals)
         wait_for(lambda: all(output.healths[name].received > 2 * RATE_HZ for name in NAMES), "samples of all sensors")
+        wait_for(lambda: all(read_sample_numbers(tmp_path / "store" / name) for name in NAMES), "recorded samples")
         before = dict(output.healths)
         process = supervisor._workers[0].process
         assert process is not None
