@@ -74,7 +74,7 @@ MAX_CACHED_PRODUCTS: Final = 2048
 MAX_CACHED_BASES: Final = 512
 MAX_CACHED_UNIT_EFFECTS: Final = 4096
 MIN_LINE_POWER_GAIN: Final = 1e-12
-"""Smallest assumed power gain of a filter for a line. A smaller gain would give a huge amplitude before the filter."""
+"""Smallest assumed power gain of a filter for a line, which prevents a division by zero."""
 INITIAL_FLOOR_RATIO: Final = 1e-3
 """Smallest starting value of the white noise added after a low-pass filter, relative to the total power."""
 Effects = tuple[Effect, ...]

@@ -362,7 +362,7 @@ def find_maximum_by_golden_section(function: Callable[[float], float], lo: float
 
 
 def compute_size_interval(fit: AxisFit, effect_index: int) -> ParameterInterval:
-    """Compute the 95 % interval of the size of an effect.
+    """Compute the 95 % interval of the size of an effect. A fixed size has no interval.
 
     The interval is symmetric for a deterministic effect, and symmetric on a logarithmic scale for a noise effect. If a
     noise effect is hardly significant, the interval of its variance is symmetric and may include zero.
