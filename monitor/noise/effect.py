@@ -6,8 +6,8 @@ An effect is a frozen dataclass of parameters. There are five kinds of effects.
 - An ``AxisLeak`` adds the measurement of another axis, multiplied by a coefficient.
 - ``WhiteNoiseGain`` and ``HeavyTails`` multiply the white noise of an axis by a factor.
 - An ``AxisPermutation`` replaces the output of an axis by the output of another axis.
-- A ``Transform`` modifies the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
-  Low-pass filters act before the leaks are added, because the measurements of other axes are already filtered.
+- A ``Transform`` modifies the sum of the sources, before or after the leaks are added. The order of the transforms is
+  ``monitor.noise.effects.TRANSFORM_ORDER``.
 
 Simulated samples depend only on the random generator and the sample index, not on how the samples are divided into
 blocks. Effects do not access files, clocks or global state.
@@ -222,9 +222,12 @@ class WhiteNoiseGain(Effect):
 
 
 class Transform(Effect):
-    """Effect that modifies the sum of all sources and leaks of an axis."""
+    """Effect that modifies the sum of the sources of an axis, before or after the leaks are added."""
 
     __slots__ = ()
+
+    precedes_leaks: ClassVar[bool] = False
+    """True if the effect acts before leaks from other axes are added."""
 
     @abstractmethod
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:

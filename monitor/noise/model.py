@@ -21,7 +21,6 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.signal_chain.bandwidth_limit import BandwidthLimit
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import (
     format_model_as_text_table,
@@ -173,21 +172,18 @@ class NoiseModel:
             if isinstance(effect, Source):
                 once = stepped and isinstance(effect, AngleRandomWalk)
                 total += nan_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
-        for effect in effects:
-            if isinstance(effect, BandwidthLimit):
-                total = effect.transform_spectrum(total)
-        return total
+        return self._transformed(axis, total, before_leaks=True)
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
-        for transform in self.transforms_in_order(axis):
-            if not isinstance(transform, BandwidthLimit):
+        """Return the spectrum of the measurement, given the spectrum of the filtered sources and leaks."""
+        return self._transformed(axis, spectrum, before_leaks=False)
+
+    def _transformed(self, axis: str, spectrum: Spectrum, before_leaks: bool) -> Spectrum:
+        found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
+        for transform in sorted(found, key=lambda one: TRANSFORM_ORDER.index(type(one))):
+            if transform.precedes_leaks == before_leaks:
                 spectrum = transform.transform_spectrum(spectrum)
         return spectrum
-
-    def transforms_in_order(self, axis: str) -> list[Transform]:
-        """Return the transforms of an axis in the order in which they are applied."""
-        found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
-        return sorted(found, key=lambda transform: TRANSFORM_ORDER.index(type(transform)))
 
     # --- time series
 

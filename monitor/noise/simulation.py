@@ -39,7 +39,6 @@ from monitor.noise.effects.coupling.axis_permutation import AxisPermutation
 from monitor.noise.effects.disturbances.common_vibration import CommonVibration
 from monitor.noise.effects.disturbances.heavy_tails import HeavyTails
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.signal_chain.bandwidth_limit import BandwidthLimit
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_toml import prefix_config_errors
 from monitor.noise.temperature import Temperature, recorded_temperature
@@ -222,7 +221,7 @@ class ModelStream:
         elif isinstance(effect, Transform):
             with prefix_config_errors(f"{axis}.{effect.name}"):
                 running = effect.start_transform(self._true_hz, self._rng(axis, effect.name, occurrence))
-            if isinstance(effect, BandwidthLimit):
+            if effect.precedes_leaks:
                 line.filters.append(running)
             else:
                 line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)

@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert
+from scipy.signal import hilbert, welch
 from scipy.stats import kstest
 
 from drivers.data_types import AXES
@@ -73,6 +73,20 @@ def test_cross_axis_effects_read_the_source_without_its_own_cross_axis_effects()
     read, mixed = alone.simulate(5000, RATE_HZ, 2), both.simulate(5000, RATE_HZ, 2)
     np.testing.assert_allclose(mixed[:, 0], np.clip(bare[:, 0] + 0.5 * read[:, 1], -9.0, 9.0))
     np.testing.assert_allclose(mixed[:, 1], 3.0 * np.rint((bare[:, 1] + 0.25 * read[:, 0]) / 3.0))
+
+
+def test_filter_acts_before_leaks_are_added():
+    filtered = {
+        "gx": (AngleRandomWalk(N=1.0), BandwidthLimit(cutoff=4.0, order=2, floor=0.05), ScaleFactor(factor=1.5)),
+        "gy": (AngleRandomWalk(N=1.0), BandwidthLimit(cutoff=20.0)),
+    }
+    leaking = NoiseModel(filtered) + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=0.5),)})
+    alone, mixed = NoiseModel(filtered).simulate(65_536, RATE_HZ, 2), leaking.simulate(65_536, RATE_HZ, 2)
+    np.testing.assert_allclose(mixed[:, 0], alone[:, 0] + 1.5 * 0.5 * alone[:, 1])
+    f_hz, measured = welch(mixed[:, 0], RATE_HZ, nperseg=256, return_onesided=False)
+    wanted = (0.01 < np.abs(f_hz) / RATE_HZ) & (np.abs(f_hz) / RATE_HZ < 0.49)
+    expected = leaking.two_sided_psd("gx", np.abs(f_hz[wanted]), 1.0 / RATE_HZ)
+    np.testing.assert_allclose(measured[wanted], expected, rtol=0.25)  # four standard deviations
 
 
 def test_held_samples_do_not_depend_on_cross_axis_effects():

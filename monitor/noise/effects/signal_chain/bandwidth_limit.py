@@ -42,6 +42,7 @@ class BandwidthLimit(Transform):
     floor: float | None = parameter_field("rad/√s", "m/s/√s", optional=True)
     kind: str | None = choice_field(*FILTER_KINDS)
 
+    precedes_leaks: ClassVar[bool] = True  # the measurements of other axes are already filtered
     description: ClassVar[str] = "The low-pass filter of the sensor attenuates fast motion and high-frequency noise."
 
     @property
