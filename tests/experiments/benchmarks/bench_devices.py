@@ -2,16 +2,22 @@
 
     python -m tests.experiments.benchmarks.bench_devices [--devices 1 4 16 64] [--rate 1000] [--seconds 30]
         [--parts default viewer ...] [--read-timeout 0.01] [--workers auto] [--window 10min] [--burst 1]
+        [--share 0.25]
 
 Another process writes VectorNav binary frames to one pseudo-terminal for each device. The daemon reads them with its
 serial link and default settings, except for the length of the window. This process subscribes to all messages of the
 daemon. The processor time of all processes of the daemon is measured from 5 s after the first sample to the last
 sample. The latency is the time from the write of the newest frame of a result until this process receives the
 coefficients. Shared memory pages count once (PSS). Every sample must be received, bad or lost.
+
+``--share`` simulates a slower board: the daemon runs on one processor with so many busy processes that it gets about
+this share of the processor. The sensors and the subscriber use the other processors.
 """
 
 import argparse
+import contextlib
 import json
+import os
 import re
 import time
 from collections.abc import Mapping
@@ -22,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, run_busy_processes
 from tests.experiments.benchmarks.rig import NO_VIEWER, PATIENCE_S, Daemon, Sensors, open_session
 from tests.support.waiting import wait_for
 
@@ -76,8 +82,12 @@ def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> t
     tables += f"[service]\nworkers = {options.workers if options.workers != 'auto' else chr(34) + 'auto' + chr(34)}\n"
     sensors = Sensors(folder, devices, rate_hz, WARM_UP_S + seconds, burst=options.burst)
     driver = "" if options.read_timeout is None else f"read_timeout = {options.read_timeout}"
+    published, busy, processors = PublishedMessages(), contextlib.ExitStack(), os.sched_getaffinity(0)
+    if options.share is not None:
+        busy.enter_context(run_busy_processes(round(1.0 / options.share) - 1, {min(processors)}))
     daemon = Daemon(folder, devices, rate_hz, options.window, more, driver=driver, tables=tables)
-    published = PublishedMessages()
+    if options.share is not None:
+        os.sched_setaffinity(0, processors - {min(processors)})
     try:
         with open_session(daemon.port) as session, session.declare_subscriber("imu/**", published.take):
             wait_for(lambda: len(published.status) == devices, "the first status")
@@ -95,6 +105,7 @@ def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> t
         written_ns = sensors.written_ns()
     finally:
         daemon.close()
+        busy.close()
         sensors.close()
     late_ms = [(at_ns - written_ns[n - 1]) / 1e6 for n, at_ns in published.results if n > WARM_UP_S * rate_hz]
     counts = [published.total(name) for name in ("received", "bad", "lost", "overflowed")]
@@ -126,6 +137,7 @@ def main() -> None:
     parser.add_argument("--read-timeout", type=float, metavar="S")
     parser.add_argument("--workers", default="auto")
     parser.add_argument("--window", default="10min")
+    parser.add_argument("--share", type=float, help="share of one processor, e.g. 0.25")
     parser.add_argument("--burst", type=int, default=1, metavar="FRAMES")
     options = parser.parse_args()
     console.print(describe_machine())

@@ -20,33 +20,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine
+from tests.experiments.benchmarks.machine import Load, console, create_table, describe_machine, run_busy_processes
 from tests.support.zenoh_sessions import open_session
 
 ROOT = Path(__file__).parents[3]
 HOST, PORT = "127.0.0.1", 7450
 PATIENCE_S = 900.0
-
-
-@contextlib.contextmanager
-def run_busy_processes(processes: int, processors: set[int]) -> Iterator[None]:
-    """Keep processors busy with child processes."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, processors)  # child processes inherit this
-    children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
-    try:
-        yield
-    finally:
-        for child in children:
-            child.kill()
-            child.wait()
-        os.sched_setaffinity(0, before)
 
 
 def measure_start(cache: Path) -> dict[str, float]:

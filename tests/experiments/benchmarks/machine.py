@@ -4,10 +4,13 @@ The methods of a comparison run alternately, so that a load by other processes a
 processor time of the whole machine less that of this process and its children.
 """
 
+import contextlib
 import os
 import platform
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 from typing import Final
 
@@ -38,6 +41,21 @@ class Load:
     def describe(self) -> str:
         """Return a sentence for the end of a table."""
         return f"other processes used {self.others():.2f} of {os.cpu_count()} cores during the measurement"
+
+
+@contextlib.contextmanager
+def run_busy_processes(processes: int, processors: set[int]) -> Iterator[None]:
+    """Keep processors busy with child processes. Other processes that start meanwhile use the same processors."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, processors)  # child processes inherit this
+    children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+        os.sched_setaffinity(0, before)
 
 
 def _busy_s() -> float:
