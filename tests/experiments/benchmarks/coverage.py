@@ -99,14 +99,15 @@ def tables(chunks: list[Chunk]) -> str:
     """Return the tables in Markdown."""
     groups = group_chunks(chunks)
     parts = [
-        "The first table gives the percentage of correct results. The figure for deviations is the average over all τ "
-        "up to an eighth of the record. The figure for the worst τ is in parentheses.",
+        "The first table gives the percentage of intervals and bounds that are correct. The figure for Allan "
+        "deviations is the average over all τ up to an eighth of the record. The figure in parentheses is that of the "
+        "worst τ.",
         format_table(("record", "noise", "deviations", *SYMBOLS), [_correct(*g) for g in groups.items()]),
-        "The next table gives the percentage of records in which a term is estimated. Parentheses mark terms that the "
-        "noise does not contain.",
+        "The next table gives the percentage of records in which each term is estimated. Parentheses mark terms that "
+        "the noise does not contain.",
         format_table(("record", "noise", *SYMBOLS), [_estimated(*g) for g in groups.items()]),
         "A figure is bold if its 95 % interval lies entirely outside the expected range. The expected range is "
-        f"{_percent(*TWO_SIDED)} % for deviations, {_percent(*RESULT_TARGET)} % for terms, and "
+        f"{_percent(*TWO_SIDED)} % for deviations, {_percent(*RESULT_TARGET)} % for terms that the noise contains, and "
         f"{_percent(*ABSENT_TARGET)} % for the estimates of absent terms.",
     ]
     return "\n\n".join(parts)

@@ -193,7 +193,8 @@ def tables(chunks: list[Chunk]) -> str:
             figures.setdefault((format_length(seconds), name), {})[cell] = text
     cells = [cell for cell in CELLS if any(cell in row for row in figures.values())]
     rows = [(*key, *(row.get(cell, "") for cell in cells)) for key, row in figures.items()]
-    return "Each cell gives the figures of Q, N, B and K.\n\n" + format_table(("record", "estimator", *cells), rows)
+    intro = "Each cell gives the values for Q, N, B and K, in this order.\n\n"
+    return intro + format_table(("record", "estimator", *cells), rows)
 
 
 def _figures(seconds: int, cell: str, group: list[Chunk]) -> dict[str, str]:
