@@ -21,7 +21,7 @@ class AngleRandomWalk(Source):
     N: float = parameter_field("rad/√s", "m/s/√s")
 
     description: ClassVar[str] = (
-        "The rate contains white noise, whose mean decreases with the square root of the averaging time."
+        "The rate contains white noise, so the error of a mean decreases with the square root of the averaging time."
     )
 
     def spectrum(self, tau0_s: float) -> Spectrum:
