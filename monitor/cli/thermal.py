@@ -22,7 +22,7 @@ def thermal_fit(
         str | None,
         typer.Option(
             metavar="S",
-            help="Averaging interval: S seconds, or e.g. 10min or 1h; by default, a 72nd of the recording.",
+            help="Averaging interval: S seconds, or e.g. 10min or 1h; by default, about 72 intervals per recording.",
         ),
     ] = None,
     units: options.Units = "imu",
