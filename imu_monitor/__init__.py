@@ -1,16 +1,16 @@
 """Python interface of imu-monitor, and the entry point of the command ``imu-monitor``.
 
-The names in ``__all__`` are the public interface (docs/reference/python-api.md). They are imported at their first
-use, so that ``import imu_monitor`` and the start of the command stay fast.
+The names in ``__all__`` are the public interface (docs/reference/python-api.md). Each name is imported when it is first
+used, so that ``import imu_monitor`` and the start of the command stay fast.
 
-``monitor`` and ``drivers`` are common names. Another package or module of such a name on ``PYTHONPATH`` (every ROS
-shell sets it), in the current folder or imported by a ``sitecustomize`` would be found first. This package has a name
-of its own. It stands beside the folders ``monitor``, ``drivers`` and ``config``. When it is imported, it binds the
-names ``monitor`` and ``drivers`` to these folders. The order of ``sys.path`` stays as it is, so that a module in
-``site-packages`` cannot take the place of a module of the standard library. ``config`` holds data only and is found
-beside ``monitor`` by its path.
+``monitor`` and ``drivers`` are common names. Another package with one of these names would be found first if it is in
+the current folder, in a folder on ``PYTHONPATH`` (which every ROS shell sets), or imported by a ``sitecustomize``. The
+name ``imu_monitor`` is unique, and the package is next to the folders ``monitor``, ``drivers`` and ``config``. The
+import of ``imu_monitor`` binds the names ``monitor`` and ``drivers`` to these folders. The order of ``sys.path`` is not
+changed, so that a module in ``site-packages`` cannot replace a module of the standard library. The folder ``config``
+contains only data, and is located by its path next to ``monitor``.
 
-``imu-monitor`` and ``python -m imu_monitor`` end in ``main``.
+The commands ``imu-monitor`` and ``python -m imu_monitor`` call ``main``.
 """
 
 import contextlib
@@ -73,37 +73,37 @@ _MODULES: Final = {
     "imu_monitor._allan_window": ("AllanWindow",),
     "monitor.noise.model": ("NoiseModel",),
 }
-"""Modules that define the public names, which are imported at their first use."""
+"""Modules that define the public names. A module is imported when one of its names is first used."""
 
 FOLDER: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 PACKAGES: Final = ("monitor", "drivers")
 REQUIRED: Final = {"monitor": "cli/__init__.py", "drivers": "errors.py", "config": "demo.toml"}
-"""A file of each folder that a foreign folder of that name does not have."""
+"""For each folder, a file that a folder of another project with the same name does not contain."""
 DEBUG: Final = "--debug"
 FAILED: Final = 1
 GARBAGE_THRESHOLD: Final = 20_000
-"""Number of new objects between two searches for garbage. Imports create many objects that are no garbage."""
+"""Number of new objects between two garbage collections. Imports create many objects that are not garbage."""
 
 
 class OwnPackages(MetaPathFinder):
-    """Finds ``monitor`` and ``drivers`` beside this package, and nothing else."""
+    """Finder for the packages ``monitor`` and ``drivers`` next to this package. Other modules are not found."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return where a package of the program is; None for every other module."""
+        """Return the location of ``monitor`` or ``drivers``. Return None for any other module."""
         return PathFinder.find_spec(fullname, [FOLDER], target) if fullname in PACKAGES else None
 
 
 def bind_own_packages() -> None:
-    """Make ``monitor`` and ``drivers`` mean the folders beside this package, from now on and in this process.
+    """Bind the names ``monitor`` and ``drivers`` to the folders next to this package, in the whole process.
 
-    Foreign modules of these names that are already imported are dropped from ``sys.modules``.
+    If modules of other projects with these names have already been imported, they are removed from ``sys.modules``.
 
     Raises
     ------
     ImportError
-        A folder beside this package is missing or belongs to another package. The text names the folder.
+        If a folder next to this package is missing or belongs to another package. The error text names the folder.
     """
     for name, file in REQUIRED.items():
         folder = os.path.join(FOLDER, name)
@@ -121,9 +121,9 @@ def bind_own_packages() -> None:
 
 
 def open_standard_streams() -> None:
-    """Give closed standard streams a file descriptor, so that no file that is opened later takes their numbers.
+    """Open the standard streams that are closed, so that files that are opened later do not get their numbers.
 
-    Standard input is empty and standard error goes nowhere. Writing to standard output fails, as with a closed one.
+    Standard input is then empty, and standard error is discarded. Writing to standard output still fails.
     """
     for number, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
@@ -142,7 +142,7 @@ def open_standard_streams() -> None:
 
 
 def main() -> None:
-    """Run the program; it ends with ``SystemExit``."""
+    """Run the program, and end with ``SystemExit``."""
     open_standard_streams()
     gc.set_threshold(GARBAGE_THRESHOLD)
     debug = DEBUG in sys.argv[1:]
@@ -173,7 +173,7 @@ def _fail(line: str) -> NoReturn:
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use.
+    """Import a public name when it is first used.
 
     Raises
     ------

@@ -21,7 +21,7 @@ MAX_MISSING: Final = (1 << 63) - 1
 class AllanWindow:
     """Streaming estimator of Allan deviations and noise coefficients in a sliding window.
 
-    Each appended sample enters the window, and the oldest sample leaves the full window. The cost of a sample does not
+    If the window is full, each appended sample replaces the oldest sample. The computing time per sample does not
     depend on the length of the window.
 
     Parameters
@@ -29,7 +29,7 @@ class AllanWindow:
     rate_hz : float
         Sample rate in Hz.
     window_s : float
-        Length of the window in s. The window holds 100 to 10 000 000 samples.
+        Length of the window in s. The length must correspond to 100 to 10 000 000 samples.
     axes : str or sequence of str, optional
         Axis of each column of the samples. By default, all six axes.
     tau : {"octave", "decade10"} or sequence of float
@@ -103,12 +103,12 @@ class AllanWindow:
             Samples of the k ``axes`` in rad/s and m/s²; NaN means missing. A one-dimensional array is one sample of
             several axes, or n samples of one axis.
         missing_before : int
-            Number of samples that are missing just before these samples.
+            Number of samples that are missing directly before the appended samples.
 
         Raises
         ------
         ConfigError
-            If the shape does not fit to ``axes``, or if ``missing_before`` is negative.
+            If the shape of ``values`` does not match ``axes``, or if ``missing_before`` is negative.
         """
         rows = np.asarray(values, np.float64)
         if rows.ndim <= 1:

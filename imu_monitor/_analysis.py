@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class Analysis(AllanEstimate):
     """Allan deviations, noise coefficients and notes of a recording, as ``analyze`` returns them.
 
-    ``to_dict`` also contains motion, noise changes, the bandwidth of each axis and, if they have been computed, the
-    results over time.
+    The dictionary that ``to_dict`` returns also contains motion, noise changes, the bandwidth of each axis and, if
+    ``window_s`` was given, the results over time.
     """
 
     def __init__(self, results: AnalysisResults) -> None:
@@ -92,7 +92,7 @@ def analyze(
 ) -> Analysis:
     """Compute Allan deviations and noise coefficients, and detect motion, noise changes and spectral lines.
 
-    The function gives the results of ``imu-monitor analyze``.
+    The results are the same as those of the command ``imu-monitor analyze``.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def analyze(
         - an array of shape (n, 6) in the order gx, gy, gz, ax, ay, az, or of shape (n, k) with k ``axes``, or of shape
           (n,) with one axis.
     rate_hz : float, optional
-        Sample rate in Hz. It is needed if the samples have no times, and otherwise takes precedence over them.
+        Sample rate in Hz. Required if the samples have no times. If given, the rate takes precedence over the times.
     axes : str or sequence of str, optional
         Axis of each column of an array. By default, all six axes.
     tau : {"octave", "decade10"} or sequence of float
@@ -112,9 +112,9 @@ def analyze(
     window_s : float, optional
         Length in s of a sliding window. If given, the result also contains Allan deviations over time.
     exclude_motion : bool
-        True to exclude samples in motion from the Allan variance.
+        True to exclude samples taken during motion from the Allan variance.
     total_and_hadamard : bool
-        True to compute total and Hadamard deviations too, which takes several times as long.
+        True to compute total and Hadamard deviations as well. The analysis then takes several times as long.
 
     Returns
     -------

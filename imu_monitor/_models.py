@@ -37,7 +37,7 @@ def list_models() -> list[str]:
 
 @errors_name_arguments()
 def load_model(name_or_path: str | PathLike[str]) -> NoiseModel:
-    """Read a noise model from a file, or take one of the shipped models.
+    """Read a noise model from a file, or return one of the shipped models.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def simulate(
 ) -> Recording:
     """Simulate a recording of a noise model.
 
-    The function gives the samples of ``imu-monitor simulate``.
+    The samples are the same as those that ``imu-monitor simulate`` writes with the same seed.
 
     Parameters
     ----------
@@ -145,8 +145,8 @@ def export_parameters(
 ) -> str:
     """Return noise parameters as the text of a parameter file of another program.
 
-    The function gives the text of ``imu-monitor export``. The text contains units, the source of the parameters and,
-    for an analysis, the 95 % intervals.
+    The text is the same as the output of ``imu-monitor export``. Comments in the text state the units and the source of
+    the parameters. For an analysis, the comments also state the 95 % intervals.
 
     Parameters
     ----------
@@ -155,18 +155,18 @@ def export_parameters(
     format : str
         Program that reads the parameters, such as "kalibr", "openvins", "px4_ekf2" (docs/reference/export.md).
     inflation : float
-        Factor on N, B and K, at least 1.
+        Factor by which N, B and K are multiplied, at least 1.
     dt_s : float, optional
-        Time step in s of the program that reads the parameters, for some formats.
+        Time step in s of the program that reads the parameters. Only for formats that depend on the time step.
     correlation_time_s : float, optional
         Correlation time in s of the process that represents B, for the formats "kalman" and "gnss_ins_sim".
     rostopic : str, optional
-        Topic of the IMU, for some formats.
+        Topic of the IMU. Only for formats that contain a topic.
 
     Raises
     ------
     ConfigError
-        If the format is unknown, an option does not belong to the format, or the model lacks a coefficient.
+        If the format is unknown, an argument does not apply to the format, or the model lacks a coefficient.
     NotReady
         If the recording is too short to determine a coefficient.
 

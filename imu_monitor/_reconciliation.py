@@ -37,7 +37,7 @@ class Reconciliation:
 
     @property
     def verdict(self) -> Literal["agrees", "explained", "partly_explained", "unexplained"]:
-        """Decision: the model agrees, or its differences are explained, partly explained or unexplained."""
+        """Decision whether the recording agrees with the model and, if not, whether known effects explain why."""
         return self._result.verdict
 
     @property
@@ -75,7 +75,7 @@ class Reconciliation:
         return result
 
     def to_dataframe(self) -> "pd.DataFrame":
-        """Return the findings as a pandas DataFrame, the largest share of the difference first.
+        """Return the findings as a pandas DataFrame, sorted by the share of the gap that they explain, largest first.
 
         Raises
         ------
@@ -142,7 +142,8 @@ def reconcile(
 ) -> Reconciliation:
     """Compare samples with a noise model, and find the effects that the model lacks.
 
-    The function gives the result of ``imu-monitor reconcile``. It takes seconds to minutes, and needs SciPy.
+    The result is the same as that of the command ``imu-monitor reconcile``. The comparison takes seconds to minutes,
+    and needs SciPy.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ def reconcile(
         Noise model, name of a shipped model, or path of a model file. By default, the five noise terms Q, N, B, K and R
         are fitted to the samples.
     rate_hz : float, optional
-        Sample rate in Hz. It is needed if the samples have no times.
+        Sample rate in Hz. Required if the samples have no times.
     axes : str or sequence of str, optional
         Axis of each column of an array. By default, all six axes.
     seed : int

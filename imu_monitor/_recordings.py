@@ -41,13 +41,13 @@ class Recording(recordings.Recording):
         Times as stored, with any origin: float64 in s, or int64 in ns if the source contains whole ns, µs or ms. None
         if only the sample rate is known.
     t_s, t_ns : ndarray of float64 or int64, shape (n,), or None
-        Times in s or in ns. They are computed at each access if the stored times have the other unit.
+        Times in s or in ns. If the stored times have the other unit, the times are converted at each access.
     values : ndarray of float64, shape (n, 6)
         Angular rates in rad/s and accelerations in m/s², in the order gx, gy, gz, ax, ay, az. NaN means missing.
     temperature_c : ndarray of float64, shape (n,)
         Temperatures in °C. NaN means missing.
     rate_hz : float or None
-        Sample rate in Hz that the file or the caller states. None if the rate follows from the times.
+        Sample rate in Hz as stated by the file or by the caller. None if only the times determine the sample rate.
     axes : tuple of str
         Measured axes.
     notes : tuple of str
@@ -168,9 +168,9 @@ def read_recording(
     rate_hz : float, optional
         Sample rate in Hz, for a file without the column ``t``.
     last_s : float, optional
-        Duration in s of the part to read at the end of the recording. By default, the whole recording is read.
+        Read only the last ``last_s`` seconds of the recording. By default, the whole recording is read.
     topic : str, optional
-        Topic to read from a ROS bag or a log of PX4. By default, its only IMU is read.
+        Topic to read from a ROS bag or an autopilot log. Required only if the file contains several IMUs.
     columns : mapping of str to str or int, optional
         Column of a table for each quantity (``t``, ``gx``, …, ``temperature``): a name, a number from 1, or ``"-"`` to
         leave the quantity out. By default, the columns are recognized by their names.

@@ -88,13 +88,13 @@ class Settings(LinkSettings):
     bitrate: Annotated[int, BIT_RATE] | None = Field(
         None,
         examples=[500_000],
-        description="bit rate; absent: as the interface is set, e.g. by ip link set can0 up type can bitrate 500000",
+        description="bit rate; absent: as set in the interface, e.g. by ip link set can0 up type can bitrate 500000",
     )
-    fd: bool = Field(False, description="CAN FD")
+    fd: bool = Field(False, description="true: use CAN FD")
     data_bitrate: Annotated[int, BIT_RATE] | None = Field(
-        None, examples=[2_000_000], description="bit rate of the data phase of CAN FD; absent: as the interface is set"
+        None, examples=[2_000_000], description="bit rate of the data phase of CAN FD; absent: as set in the interface"
     )
-    receive_own_messages: bool = Field(False, description="true: receive frames that this process sends, too")
+    receive_own_messages: bool = Field(False, description="true: also receive the frames that this process sends")
     options: dict[str, Any] = Field({}, description="additional keys of python-can's Bus for this interface")
 
 

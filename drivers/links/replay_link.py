@@ -93,7 +93,7 @@ class Settings(LinkSettings, ReadingOptions):
     bytes_per_second: Annotated[float, BYTE_RATE] | None = Field(
         None,
         examples=[11_520.0],
-        description="pace of captured bytes, a tenth of the baud rate; absent: as fast as they are read",
+        description="captured bytes per second, a tenth of the baud rate; absent: as fast as they are read",
     )
     channel: str | None = Field(
         None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"

@@ -70,22 +70,22 @@ class Settings(LinkSettings):
     )
     baudrate: Annotated[int, BIT_RATE] = Field(115200, description="baud rate")
     bytesize: Literal[5, 6, 7, 8] = Field(8, description="data bits")
-    parity: Literal["N", "E", "O", "M", "S"] = Field("N", description="none, even, odd, mark or space")
+    parity: Literal["N", "E", "O", "M", "S"] = Field("N", description="parity: none, even, odd, mark or space")
     stopbits: Annotated[float, checked_by(_check_stop_bits)] = Field(1.0, description="stop bits: 1, 1.5 or 2")
-    rtscts: bool = Field(False, description="hardware flow control")
-    xonxoff: bool = Field(False, description="software flow control")
+    rtscts: bool = Field(False, description="true: use hardware flow control")
+    xonxoff: bool = Field(False, description="true: use software flow control")
     exclusive: bool = Field(True, description="true: other programs cannot open the port")
     read_timeout: Annotated[float, READ_TIMEOUT_S] | None = Field(
         None,
         examples=[0.01],
-        description="time in s that received bytes may wait for more bytes; absent: interval of `publish`, 4 to 100 ms",
+        description="longest time in s for which received bytes wait; absent: interval of `publish`, 4 to 100 ms",
     )
     first_request: Annotated[str, checked_by(parse_request)] = Field(
         "", description="bytes in hexadecimal that are written once after the port has been opened; empty: none"
     )
     request: Annotated[str, checked_by(parse_request)] = Field(
         "",
-        description="bytes in hexadecimal that are written repeatedly, for a sensor that only answers; empty: none",
+        description="bytes in hexadecimal that are written repeatedly if the sensor only answers requests; empty: none",
     )
     request_rate: Annotated[float, REQUEST_RATE_HZ] = Field(100.0, description="number of requests per second")
 

@@ -50,9 +50,9 @@ class Settings(LinkSettings):
 
     host: str = Field(
         "127.0.0.1",
-        description='address of this computer to receive at; "0.0.0.0" = all, so that other computers can send',
+        description='local address on which data are received; "0.0.0.0" = all, so that other computers can send',
     )
-    port: Annotated[int, PORT] = Field(examples=[14550], description="UDP port to receive at")
+    port: Annotated[int, PORT] = Field(examples=[14550], description="UDP port on which data are received")
 
 
 class UdpLink(PolledLink):

@@ -58,7 +58,7 @@ class Settings(LinkSettings):
     mode: Literal["peer", "client"] | None = Field(
         None,
         examples=["client"],
-        description="mode of the session; absent: as in the file, else client of one endpoint, otherwise peer",
+        description="mode of the session; absent: as in the zenoh file, or client if there is one endpoint, else peer",
     )
     connect: ListOf[str] = Field((), examples=[["tcp/127.0.0.1:7447"]], description="endpoints to connect to")
     listen: ListOf[str] = Field(

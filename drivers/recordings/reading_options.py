@@ -31,7 +31,9 @@ class ReadingOptions(SettingsModel):
     """Options for reading a recording."""
 
     topic: str | None = Field(
-        None, examples=["/imu/data"], description="topic of a ROS bag or of a log of an autopilot; absent: the only IMU"
+        None,
+        examples=["/imu/data"],
+        description="topic of a ROS bag or an autopilot log; absent: the only topic with IMU data",
     )
     columns: dict[Annotated[str, one_of(COLUMNS)], Annotated[str, BeforeValidator(_to_column_reference)]] = Field(
         {},
@@ -40,16 +42,20 @@ class ReadingOptions(SettingsModel):
         "absent: recognized by name",
     )
     gyro_unit: Annotated[str, checked_by(units.angular_rate_factor)] | None = Field(
-        None, examples=["deg/s"], description="unit of gx gy gz in the file; absent: as the file states, or rad/s"
+        None,
+        examples=["deg/s"],
+        description="unit of gx gy gz in the file; absent: unit that the file states, or rad/s",
     )
     accel_unit: Annotated[str, checked_by(units.acceleration_factor)] | None = Field(
-        None, examples=["g"], description="unit of ax ay az in the file; absent: as the file states, or m/s²"
+        None, examples=["g"], description="unit of ax ay az in the file; absent: unit that the file states, or m/s²"
     )
     temperature_unit: Annotated[str, checked_by(units.temperature_factor_and_offset)] | None = Field(
-        None, examples=["K"], description="unit of the temperature in the file; absent: as the file states, or °C"
+        None,
+        examples=["K"],
+        description="unit of the temperature in the file; absent: unit that the file states, or °C",
     )
     time_unit: Annotated[str, checked_by(units.time_factor)] | None = Field(
-        None, examples=["ns"], description="unit of t in the file; absent: as the file states, or s"
+        None, examples=["ns"], description="unit of t in the file; absent: unit that the file states, or s"
     )
 
 

@@ -11,26 +11,31 @@ from monitor.cli.shared import options, output
 
 @options.with_loading_options
 def analyze(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File of a recording, or folder of segments.")],
     tau: Annotated[
-        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
+        str,
+        typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: name of a grid, or list of times in s."),
     ] = "octave",
     window: Annotated[
         str | None,
         typer.Option(
-            metavar="S", help="Also compute Allan deviations over time, in a window of S seconds; also 5min, 1h."
+            metavar="S",
+            help="Also compute Allan deviations over time, in a sliding window of S seconds, or e.g. 5min or 1h.",
         ),
     ] = None,
-    rest: Annotated[bool, typer.Option("--rest", help="Leave out periods in which the sensor moved.")] = False,
+    rest: Annotated[bool, typer.Option("--rest", help="Exclude periods in which the sensor moved.")] = False,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
+        typer.Option(
+            metavar="FILE.png|.html",
+            help="Write the Allan deviations as a picture, or the whole result as an HTML page.",
+        ),
     ] = None,
     loading: options.Loading = None,
 ) -> None:
-    """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
+    """Print Allan deviations, the noise coefficients Q, N, B, K and R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
     from monitor.commands.recording_loading import load_recording
     from monitor.publishing.messages.analysis_json import FailedAnalysisMessage

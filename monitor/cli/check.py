@@ -15,10 +15,10 @@ def check(
         bool, typer.Option("--print-defaults", help="Print a configuration file with all keys and their defaults.")
     ] = False,
     link: Annotated[
-        str | None, typer.Option(metavar="NAME", help="With --print-defaults: print the keys of this link only.")
+        str | None, typer.Option(metavar="NAME", help="With --print-defaults: print only the keys of this link.")
     ] = None,
     decoder: Annotated[
-        str | None, typer.Option(metavar="NAME", help="With --print-defaults: print the keys of this decoder only.")
+        str | None, typer.Option(metavar="NAME", help="With --print-defaults: print only the keys of this decoder.")
     ] = None,
 ) -> None:
     """Read a configuration file and report all mistakes. No device is opened."""

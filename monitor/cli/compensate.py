@@ -12,22 +12,26 @@ from monitor.cli.shared import options, output, service_in_terminal
 
 @options.with_loading_options
 def compensate(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording without drift: .npz, .csv, .parquet, ….")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File of a recording, or folder of segments.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Compensated recording to write: .npz, .csv, .parquet, ….")],
     method: Annotated[
         str,
         typer.Option(
-            metavar="M", help="adaptive, as in the daemon; for comparison: fixed, ar, emd, wavelet (extra: denoise)."
+            metavar="M",
+            help="Method: adaptive, as in the daemon; for comparison: fixed, ar, emd, wavelet (extra: denoise).",
         ),
     ] = "adaptive",
     order: Annotated[
         str | None,
-        typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
+        typer.Option(
+            metavar="P,Q",
+            help="Order of the ARMA model of the drift, up to 2,1; by default, the BIC selects the order.",
+        ),
     ] = None,
     units: options.Units = "imu",
     json: options.JsonFile = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
+        Path | None, typer.Option(metavar="FILE.png", help="Write the drift and the Allan deviations as a picture.")
     ] = None,
     loading: options.Loading = None,
 ) -> None:

@@ -10,7 +10,7 @@ from monitor.cli.shared import options, output, service_in_terminal
 
 @options.with_loading_options
 def convert(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File of a recording, or folder of segments.")],
     out: Annotated[
         Path,
         typer.Argument(
@@ -20,7 +20,7 @@ def convert(
     ],
     loading: options.Loading = None,
 ) -> None:
-    """Write a recording in another format, without changing times or values."""
+    """Write a recording in another format, without changing its times or values."""
     from monitor.commands import convert as conversion
 
     service_in_terminal.exit_on_sigterm()

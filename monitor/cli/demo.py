@@ -15,18 +15,20 @@ def demo(
         list[str] | None,
         typer.Option(
             metavar="AXIS.EFFECT:P=V,…",
-            help="Effect that begins later, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
+            help="Effect that begins during the run, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
         ),
     ] = None,
     effect_at: Annotated[
         str | None,
-        typer.Option(metavar="S", help="Start time of the effects; 90 s by default, when change detection is active."),
+        typer.Option(
+            metavar="S", help="Time at which the effects begin; by default 90 s, when change detection is active."
+        ),
     ] = None,
     seconds: options.Seconds = None,
     viewer: options.Viewer = None,
     units: options.ConfiguredUnits = None,
 ) -> None:
-    """Run the daemon on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
+    """Run the daemon with a simulated MEMS IMU, which sends a real wire format over a pseudo-terminal."""
     from monitor.simulator.demo_config import build_demo_config as configuration
 
     service_in_terminal.run_service(

@@ -15,7 +15,7 @@ SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red
 def doctor(
     config: Annotated[
         Path | None,
-        typer.Argument(metavar="CONFIG.toml", help="Configuration file; by default only the machine is checked."),
+        typer.Argument(metavar="CONFIG.toml", help="Configuration file; without it, only the machine is checked."),
     ] = None,
     json: options.JsonFile = None,
 ) -> None:

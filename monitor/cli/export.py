@@ -30,15 +30,16 @@ def export(
         str | None,
         typer.Argument(
             metavar="MODEL.toml|NAME|RESULT.json",
-            help="Model, name of a shipped model, or JSON of analyze; - = standard input.",
+            help="Model file, name of a shipped model, or JSON output of analyze; - = standard input.",
         ),
     ] = None,
     inflation: options.Inflation = 1.0,
     dt: options.TimeStep = None,
     correlation_time: options.CorrelationTime = None,
-    rostopic: Annotated[str | None, typer.Option(metavar="T", help="Topic of the IMU; /imu0 by default.")] = None,
+    rostopic: Annotated[str | None, typer.Option(metavar="T", help="ROS topic of the IMU; by default /imu0.")] = None,
     connect: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Use the results of a running daemon, tcp/127.0.0.1:7450.")
+        str | None,
+        typer.Option(metavar="ENDPOINT", help="Use the results of a running daemon, e.g. tcp/127.0.0.1:7450."),
     ] = None,
     zenoh: options.ZenohFile = None,
     prefix: options.Prefix = "imu",

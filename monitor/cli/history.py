@@ -24,33 +24,41 @@ Get = Callable[["HistoryQuery"], "HistoryTable"]
 
 def history(
     source: Annotated[
-        Path | None, typer.Argument(metavar="CONFIG.toml|FOLDER", help="Configuration file, or folder of [storage].")
+        Path | None,
+        typer.Argument(metavar="CONFIG.toml|FOLDER", help="Configuration file, or the folder that [storage] names."),
     ] = None,
     connect: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Query a running daemon instead, e.g. tcp/127.0.0.1:7450.")
+        str | None,
+        typer.Option(metavar="ENDPOINT", help="Query a running daemon instead of a file, e.g. tcp/127.0.0.1:7450."),
     ] = None,
     zenoh: options.ZenohFile = None,
     prefix: options.Prefix = "imu",
     device: options.DeviceName = None,
     since: Annotated[
         str | None,
-        typer.Option("--from", metavar="T", help="Start: -1d, 2026-11-20, 2026-11-20T14:30; by default -1d."),
+        typer.Option(
+            "--from", metavar="T", help="Start of the period, e.g. -7d, 2026-11-20 or 2026-11-20T14:30; by default -1d."
+        ),
     ] = None,
     until: Annotated[
-        str | None, typer.Option("--to", metavar="T", help="End, written like the start; by default now.")
+        str | None, typer.Option("--to", metavar="T", help="End of the period, in the same form; by default now.")
     ] = None,
-    step: Annotated[str | None, typer.Option(metavar="S", help="Minimum time per row: 15min, 1h, 1d.")] = None,
-    axis: Annotated[str | None, typer.Option(metavar="AXIS", help="Print one axis over time: gz.")] = None,
+    step: Annotated[
+        str | None, typer.Option(metavar="S", help="Minimum time that a row covers, e.g. 15min, 1h or 1d.")
+    ] = None,
+    axis: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="Print the results of one axis over time, e.g. gz.")
+    ] = None,
     json: options.JsonFile = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="All numbers as a table: .csv, .parquet, .npz, .arrow.")
+        Path | None, typer.Option(metavar="FILE", help="Write all numbers as a table: .csv, .parquet, .npz, .arrow.")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Coefficients over time and events as a picture.")
+        Path | None, typer.Option(metavar="FILE.png", help="Write coefficients over time and events as a picture.")
     ] = None,
     units: options.Units = "imu",
 ) -> None:
-    """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
+    """Print past coefficients, temperatures, lost samples and events over a period of hours to years."""
     from rich.console import Console
 
     from drivers.data_types import AXES

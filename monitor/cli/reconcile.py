@@ -16,7 +16,8 @@ def reconcile(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RECORDING…", help="File, or folder of segments; several recordings of one sensor are compared."
+            metavar="RECORDING…",
+            help="File of a recording, or folder of segments; several recordings must be of the same sensor.",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the report and the augmented model.")],
@@ -24,13 +25,15 @@ def reconcile(
         str | None,
         typer.Option(
             metavar="MODEL.toml|NAME",
-            help="Model under test; by default Q, N, B, K and R are fitted to the first recording.",
+            help="Noise model to compare; by default, Q, N, B, K and R are fitted to the first recording.",
         ),
     ] = None,
     seed: options.ReportSeed = 1,
     units: options.Units = "imu",
     json: options.JsonFile = None,
-    details: Annotated[bool, typer.Option("--details", help="Print all findings, axes and steps.")] = False,
+    details: Annotated[
+        bool, typer.Option("--details", help="Print all findings, axes and steps of the search.")
+    ] = False,
     loading: options.Loading = None,
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""

@@ -15,7 +15,9 @@ def run(
     units: options.ConfiguredUnits = None,
     history: Annotated[
         str | None,
-        typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
+        typer.Option(
+            metavar="S", help="Also show the last part of the history in the viewer, e.g. 1d or 12h; needs [storage]."
+        ),
     ] = None,
 ) -> None:
     """Run the daemon for all devices of a configuration file until the process is interrupted."""

@@ -14,14 +14,14 @@ from monitor.cli.shared import options, output, service_in_terminal
 @partial(options.with_loading_options, rate_and_last=False)
 def simulate(
     model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
-    seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
+    seconds: Annotated[str, typer.Option(metavar="S", help="Duration in s, or with a unit, e.g. 30min, 1h or 2d.")],
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .mcap, ….")
     ],
     seed: options.SimulationSeed = 1,
     rate: options.ModelRate = None,
     temperature_from: Annotated[
-        Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
+        Path | None, typer.Option(metavar="RECORDING", help="Simulate with the temperature of this recording.")
     ] = None,
     loading: options.Loading = None,
     truth: Annotated[
@@ -32,7 +32,7 @@ def simulate(
     ] = False,
     json: options.JsonFile = None,
 ) -> None:
-    """Simulate a noise model and write the samples to a recording."""
+    """Simulate the samples of a noise model and write them to a recording."""
     from monitor.commands import simulate as simulation
     from monitor.noise.model_loading import load_model
 

@@ -8,18 +8,21 @@ import typer
 from drivers.errors import NotReady
 from monitor.cli.shared import options, output
 
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
-PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File of a recording, or folder of segments.")]
+PlotPath = Annotated[
+    Path | None, typer.Option(metavar="FILE.png", help="Write the interval means and the model as a picture.")
+]
 
 
 @options.with_loading_options
 def thermal_fit(
     recording: RecordingPath,
-    out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Model file to write.")] = None,
     interval: Annotated[
         str | None,
         typer.Option(
-            metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
+            metavar="S",
+            help="Averaging interval: S seconds, or e.g. 10min or 1h; by default, about 72 intervals per recording.",
         ),
     ] = None,
     units: options.Units = "imu",

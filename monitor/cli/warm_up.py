@@ -11,7 +11,7 @@ from monitor.cli.shared import output
 
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
-    """Compile the numerical kernels and store the compiled kernels on disk for a quick start."""
+    """Compile the numerical kernels and store them on disk, so that later commands start quickly."""
     from monitor.common.compiled import kernel_cache_folder
     from monitor.daemon.kernels import kernel_compilation, kernel_groups
 

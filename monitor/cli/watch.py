@@ -15,11 +15,13 @@ def watch(
     zenoh: options.ZenohFile = None,
     seconds: options.Seconds = None,
     units: options.Units = "imu",
-    json: Annotated[bool, typer.Option("--json", help="Print each message as one line of JSON.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print each message as one line of JSON instead of the table.")
+    ] = False,
 ) -> None:
-    """Show a live table of several daemons, whose results are received over zenoh.
+    """Show a live table of the devices of several daemons, whose results are received over zenoh.
 
-    The Allan deviations of a single device are drawn if KEYEXPR names it.
+    If KEYEXPR names a single device, its Allan deviations are also drawn.
     """
     unit_system = options.parse_units(units)
     stop = threading.Event()

@@ -47,14 +47,16 @@ Share = Annotated[float, number_ranges.FRACTION]
 class FaultsTable(SettingsModel):
     """Table ``[device.driver.faults]``: random transmission faults of a simulated sensor."""
 
-    lost: Share = Field(0.0, description="share of samples that are not sent; the counter of the sensor continues")
+    lost: Share = Field(
+        0.0, description="share of samples that are not sent, although the counter of the sensor counts them"
+    )
     repeated: Share = Field(0.0, description="share of samples that are sent twice")
     flipped: Share = Field(0.0, description="share of samples with one flipped bit")
     cut: Share = Field(0.0, description="share of samples whose frame ends too early")
     jitter: Annotated[float, number_ranges.JITTER_S] = Field(
-        0.0, description="longest random delay of a burst of bytes in s"
+        0.0, description="largest random delay of a burst of bytes in s"
     )
-    unplugged: Share = Field(0.0, description="probability per sample that the cable is pulled before the sample")
+    unplugged: Share = Field(0.0, description="probability that the cable is pulled before a sample")
     unplugged_for: Duration = Field(
         2.0, description="time in s, on the clock of the sensor, until the cable is plugged in again"
     )
@@ -86,7 +88,9 @@ class VirtualTable(LinkSettings):
     seed: Annotated[int, number_ranges.SEED] = Field(
         1, description="seed of the random numbers; the same seed gives the same samples"
     )
-    speed: Annotated[float, number_ranges.SIMULATION_SPEED] = Field(1.0, description="speed relative to real time")
+    speed: Annotated[float, number_ranges.SIMULATION_SPEED] = Field(
+        1.0, description="simulation speed relative to real time"
+    )
     effect: ListOf[str] = Field(
         (),
         examples=[["gz.sinusoidal:amplitude=1e-3,frequency=17"]],

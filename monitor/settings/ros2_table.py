@@ -49,11 +49,11 @@ class Ros2Table(SettingsModel):
     domain: Annotated[int, number_ranges.ROS_DOMAIN] | None = Field(
         None, examples=[0], description="ROS_DOMAIN_ID of the subscribers; absent: nothing is published"
     )
-    connect: ListOf[Endpoint] = Field((ROUTER,), description="router of rmw_zenoh")
+    connect: ListOf[Endpoint] = Field((ROUTER,), description="endpoint of the rmw_zenoh router")
     namespace: Annotated[str, ConvertedFrom(str, _namespace)] = Field(
-        "/", description="namespace of the node and of its imu topics"
+        "/", description="namespace of the ROS 2 node and of its imu topics"
     )
     imu: Literal["compensated", "raw", "none"] = Field(
         "compensated",
-        description="samples on <namespace>/<device>/imu/data_raw: without gyroscope drift, or as received",
+        description="samples on <namespace>/<device>/imu/data_raw: without gyroscope drift, as received, or none",
     )

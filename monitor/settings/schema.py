@@ -79,7 +79,7 @@ class Limit(SettingsModel):
     """Table ``[[device.limit]]``: bounds of one noise coefficient."""
 
     axes: Annotated[tuple[str, ...], ConvertedFrom(str, select_axes)] = Field(
-        examples=["g*"], description='gx ... az, "g*", "a*" or "*"'
+        examples=["g*"], description='axes to which the limit applies: gx ... az, "g*", "a*" or "*"'
     )
     letter: Literal["Q", "N", "B", "K", "R"] = Field(examples=["N"], description="noise coefficient")
     above: Coefficient | None = Field(
@@ -89,13 +89,15 @@ class Limit(SettingsModel):
         None, examples=[1.0e-5], description="lower bound in the SI unit of the coefficient, as in a model file"
     )
     times_model: Annotated[float, number_ranges.NOISE_RATIO] | None = Field(
-        None, examples=[1.5], description="instead of above: upper bound as a multiple of the model in force"
+        None,
+        examples=[1.5],
+        description="instead of above: upper bound as a multiple of the coefficient in the noise model of the device",
     )
     hold_s: Duration = Field(
         60.0,
         alias="hold",
         examples=["1min"],
-        description="time for which the coefficient must be beyond the bound, or within the bounds again",
+        description="time that the coefficient must stay beyond a bound, or within the bounds, before an event occurs",
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
@@ -122,13 +124,17 @@ class Device(SettingsModel):
     """Table ``[[device]]``: settings of one device."""
 
     name: Annotated[str, checked_by(_check_name)] = Field(
-        examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
+        examples=["bench-1"],
+        description="letters, digits, - and _; must be unique, because every zenoh key contains the name",
     )
     driver: Annotated[BuiltLinkAndDecoder, ConvertedFrom(dict[str, Any], build_link_and_decoder)] = Field(
         examples=[{"link": "virtual"}], description="link and decoder"
     )
     rate_hz: Annotated[float, number_ranges.RATE_HZ] | None = Field(
-        None, alias="rate", examples=[100.0], description="nominal sample rate in Hz; absent: found from the data"
+        None,
+        alias="rate",
+        examples=[100.0],
+        description="nominal sample rate in Hz; absent: measured from the sample times",
     )
     window_s: Duration = Field(3600.0, alias="window", examples=["1h"], description="length of the sliding window")
     tau: Annotated[
@@ -148,16 +154,19 @@ class Device(SettingsModel):
     )
     motion: Literal["tell", "leave out"] = Field(
         "tell",
-        description="tell: report motion; leave out: exclude motion from the noise, which delays samples by 0.5 s",
+        description="tell: report motion; leave out: also exclude samples taken during motion (delay: 0.5 s)",
     )
     alarms_per_day: Annotated[float, number_ranges.ALARMS_PER_DAY] = Field(
-        0.033, description="accepted false alarms of changed noise per day, of all axes together; 0 = no detection"
+        0.033,
+        description="accepted false alarms of noise changes per day, on all axes together; 0 = no detection",
     )
-    restart: bool = Field(True, description="true: the fit of an axis starts again after its noise has changed")
+    restart: bool = Field(
+        True, description="true: after a change of the noise of an axis, discard the older samples of this axis"
+    )
     model: Annotated[Path | None, ConvertedFrom(str, _model_in_force)] = Field(
         None,
         examples=["consumer-mems"],
-        description="model in force, with which the samples are compared: a model file, or name of a shipped model",
+        description="noise model with which the samples are compared: path of a model file, or name of a shipped model",
     )
     compensate: bool = Field(True, description="true: also publish the samples without the drift of the gyroscopes")
     thermal_s: Annotated[
@@ -166,10 +175,12 @@ class Device(SettingsModel):
         600.0,
         alias="thermal_interval",
         examples=["10min"],
-        description='averaging time of the bias for the comparison with temperature, or "off"',
+        description='length of the intervals over which the thermal models average bias and temperature, or "off"',
     )
     reconcile_folder: RelativePath | None = Field(
-        None, examples=["reports"], description="folder for the reports of command/reconcile; absent: they are not kept"
+        None,
+        examples=["reports"],
+        description="folder for the reports of command/reconcile; absent: the reports are not kept",
     )
     frame_id: FrameId = Field(FRAME_ID, description="coordinate frame of the samples in ROS 2")
     axes: Annotated[AxisMap, ConvertedFrom(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(
@@ -241,7 +252,7 @@ class ZenohTable(SettingsModel):
 
     mode: Literal["peer", "client", "router", "none"] | None = Field("peer", description="mode of the session")
     listen: ListOf[Endpoint] | None = Field(
-        (ENDPOINT,), description="endpoints on which the daemon listens; if they are in use, any free port"
+        (ENDPOINT,), description="endpoints on which the daemon listens; if they are in use, a free port is used"
     )
     connect: ListOf[Endpoint] = Field(
         (), examples=[["tcp/127.0.0.1:7447"]], description="routers or daemons to which the daemon connects"
@@ -277,18 +288,24 @@ class ViewerTable(SettingsModel):
     """Table ``[viewer]``: settings of the live viewer."""
 
     mode: Annotated[str, AfterValidator(_viewer_mode)] = Field(
-        "auto", description="auto, native, web, none, or a file ending in .rrd"
+        "auto", description="where to show the viewer: auto, native, web, none, or a file ending in .rrd"
     )
-    port: Annotated[int, number_ranges.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
-    web_port: Annotated[int, number_ranges.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
+    port: Annotated[int, number_ranges.PORT] = Field(
+        9876, description="TCP port on loopback for the data of the viewer"
+    )
+    web_port: Annotated[int, number_ranges.PORT] = Field(
+        9090, description="TCP port on loopback for the web page of the viewer"
+    )
     memory: Annotated[str, checked_by(check_memory_limit)] = Field(
-        "256MiB", description="memory for past data; the oldest data are dropped first"
+        "256MiB", description="largest memory for past data in the viewer; the oldest data are dropped first"
     )
     units: Annotated[str, one_of(tuple(UNIT_SYSTEMS))] = Field(
         "imu", description="units of the viewer and of the table in the terminal: imu, datasheet or si"
     )
     history: Duration | None = Field(
-        None, examples=["1d"], description="part of the history in [storage] that is shown when the view opens"
+        None,
+        examples=["1d"],
+        description="duration of the stored history that is shown when the viewer opens; needs [storage]",
     )
 
 
@@ -298,22 +315,24 @@ class Storage(SettingsModel):
     folder: RelativePath = Field(
         Path(),
         examples=["/var/lib/imu-monitor"],
-        description="folder; absent: nothing is kept, and a restart begins with an empty window",
+        description="folder for samples and results; absent: nothing is stored, and the window is empty at a restart",
     )
     record: bool = Field(
-        True, description="keep samples in segments that every command reads; needs imu-monitor[arrow]"
+        True, description="true: store samples in segments, which all commands can read; needs imu-monitor[arrow]"
     )
-    raw: bool = Field(False, description="also keep the received bytes, so that decoding can be repeated")
+    raw: bool = Field(False, description="true: also store the received bytes, so that they can be decoded again")
     segment_s: Annotated[float, SEGMENT_LENGTH_S, DURATION_FROM_TEXT] = Field(
-        3600.0, alias="segment", examples=["1h"], description="length of one file"
+        3600.0, alias="segment", examples=["1h"], description="duration of one segment, which is one file"
     )
     keep_s: Duration = Field(
         30 * DAY_S, alias="keep", examples=["30d"], description="age at which segments are deleted"
     )
     disk_share: Annotated[float, number_ranges.POSITIVE_SHARE] = Field(
-        0.9, description="used share of the disk above which the oldest segments are deleted"
+        0.9, description="if a larger share of the disk is in use, the oldest segments are deleted"
     )
-    history: bool = Field(True, description="keep results, events and status for years, thinned with age")
+    history: bool = Field(
+        True, description="true: store results, events and status for years; older results cover longer intervals"
+    )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:
         """Yield a conflict if segments would be deleted before they are complete."""
@@ -350,12 +369,14 @@ class Hook(SettingsModel):
         Field(examples=[["limit_crossed", "link_lost"]], description='kinds of events, or ["*"]')
     )
     devices: Annotated[frozenset[str], Strict(False)] = Field(
-        frozenset(), examples=[["bench-1"]], description="names of devices; absent: all"
+        frozenset(),
+        examples=[["bench-1"]],
+        description="names of the devices whose events are used; absent: all devices",
     )
     command: Annotated[tuple[str, ...], ConvertedFrom(ListOf[str], _program)] = Field(
         (),
         examples=[["/usr/local/bin/tell", "--loud"]],
-        description="program with arguments, without a shell; the event is JSON on standard input",
+        description="program and arguments, run without a shell; the event is sent to standard input as JSON",
     )
     key: ZenohKey | None = Field(
         None, examples=["site/alarms"], description="zenoh key on which the event is published as JSON"
@@ -376,7 +397,7 @@ class MetricsTable(SettingsModel):
     listen: Address | None = Field(
         None,
         examples=["127.0.0.1:9464"],
-        description="host and port; absent: the service does not listen; needs imu-monitor[metrics]",
+        description="host and port for the metrics; absent: the daemon does not listen; needs imu-monitor[metrics]",
     )
 
 
@@ -384,10 +405,12 @@ class InfluxTable(SettingsModel):
     """Table ``[influx]``: settings of the output to InfluxDB."""
 
     url: InfluxUrl | None = Field(
-        None, examples=[INFLUX_URL], description="write endpoint, http or https; absent: nothing is sent"
+        None,
+        examples=[INFLUX_URL],
+        description="http or https address of the write endpoint of InfluxDB; absent: nothing is sent",
     )
     token_file: RelativePath | None = Field(
-        None, examples=["influx-token"], description="file with the token; absent: requests contain no token"
+        None, examples=["influx-token"], description="file that contains the token; absent: requests contain no token"
     )
     interval_s: Annotated[float, INFLUX_INTERVAL_S, DURATION_FROM_TEXT] = Field(
         10.0, alias="interval", examples=["10s"], description="interval between two requests"
@@ -405,15 +428,17 @@ class ServiceTable(SettingsModel):
     workers: Annotated[int, KeywordOrType({"auto": 0}, Annotated[int, number_ranges.WORKERS])] = Field(
         0,
         examples=["auto"],
-        description='processes that share the devices; 1: a single process, "auto": one for each 8 devices',
+        description='number of processes that share the devices; 1: a single process, "auto": one for each 8 devices',
     )
 
 
 class LogTable(SettingsModel):
     """Table ``[log]``: settings of the log messages."""
 
-    level: Literal["debug", "info", "warning", "error"] = Field("info", description="least important level to write")
-    format: Literal["text", "json"] = Field("text", description="format of the lines")
+    level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="lowest level of messages that are written"
+    )
+    format: Literal["text", "json"] = Field("text", description="format of the log lines")
 
 
 class ConfigFile(SettingsModel):

@@ -82,7 +82,7 @@ class Settings(SettingsModel):
     )
     accel_unit: Literal["m/s^2", "g"] = Field("m/s^2", description="unit of the acceleration in z1 and s1")
     clock: Literal["device", "arrival"] = Field(
-        "device", description="source of the sample times; device: the packet counter of S1, or the time of the others"
+        "device", description="source of the sample times; device: packet counter in S1, or time in the other packets"
     )
 
 

@@ -117,10 +117,14 @@ class Settings(SettingsModel):
         ("flags", "temperature", "gyro", "accel", "gpio", "count"),
         description=f"fields that the sensor sends before the checksum: {' '.join(FIELDS)}",
     )
-    bits: Literal[16, 32] = Field(16, description="width of temperatures, rates, accelerations and other numbers")
-    accelerometer_range: Literal["8g", "16g"] = Field("8g", description="range of models that have two ranges")
+    bits: Literal[16, 32] = Field(
+        16, description="number of bits of temperatures, rates, accelerations and other numbers"
+    )
+    accelerometer_range: Literal["8g", "16g"] = Field(
+        "8g", description="accelerometer range, for models with two ranges"
+    )
     clock: Literal["count", "arrival"] = Field(
-        "count", description="source of the sample times; arrival: an external signal resets the counter"
+        "count", description="source of the sample times; use arrival if an external signal resets the counter"
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:

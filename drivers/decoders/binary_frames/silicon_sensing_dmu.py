@@ -55,7 +55,7 @@ class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     length: Literal[68, 40] = Field(
-        68, description="bytes of a message: 68, or 40 without auxiliary voltage and increments"
+        68, description="number of bytes of a message: 68, or 40 without auxiliary voltage and increments"
     )
 
 

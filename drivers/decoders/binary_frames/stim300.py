@@ -80,17 +80,18 @@ class Settings(SettingsModel):
         "10g", description="range of the installed accelerometers, which determines the scale"
     )
     gyro_output: Literal["rate", "increment"] = Field(
-        "rate", description="angular rate or its mean in °/s, or the angle of one sample in °"
+        "rate", description="rate: angular rate or its mean in °/s; increment: angle of one sample in °"
     )
     accelerometer_output: Literal["acceleration", "increment"] = Field(
-        "acceleration", description="acceleration or its mean in g, or the velocity of one sample in m/s"
+        "acceleration",
+        description="acceleration: acceleration or its mean in g; increment: velocity of one sample in m/s",
     )
     rate: Annotated[float, RATE_HZ] | None = Field(
         None, examples=[500.0], description="sample rate in Hz, which is needed if an output is an increment"
     )
     identifier: Annotated[
         int | Literal["auto"], KeywordOrType({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
-    ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
+    ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto: as in the first datagram")
     crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:

@@ -71,7 +71,7 @@ class Settings(SettingsModel):
         0.005, description="largest difference in s between the time tags of one sample in ESF-MEAS"
     )
     tick: Annotated[float, TICK_S] | None = Field(
-        None, examples=[39.0625e-6], description="unit of the time tags in ESF-RAW in s; absent: it is not known"
+        None, examples=[39.0625e-6], description="unit of the time tags in ESF-RAW in s; absent: unknown unit"
     )
     clock: Literal["time_tag", "arrival"] = Field("time_tag", description="source of the sample times")
 

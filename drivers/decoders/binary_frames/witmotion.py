@@ -50,10 +50,12 @@ class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     packet: Literal["uart", "bluetooth"] = Field(
-        "uart", description="packets of 11 bytes with a checksum, or of 20 bytes without one"
+        "uart",
+        description="uart: packets of 11 bytes with a checksum; bluetooth: packets of 20 bytes without a checksum",
     )
     temperature: Literal["wt901", "jy61"] = Field(
-        "wt901", description="temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)"
+        "wt901",
+        description="temperature formula: raw / 100 (wt901), or raw / 340 + 36.53 (jy61, also for BWT61)",
     )
     accelerometer_range: Annotated[float, FULL_SCALE] = Field(16.0, description="full scale of the accelerometer in g")
     gyro_range: Annotated[float, FULL_SCALE] = Field(2000.0, description="full scale of the gyroscope in °/s")

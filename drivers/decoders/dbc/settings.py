@@ -18,7 +18,7 @@ class SignalSettings(SettingsModel):
     """CAN signal of one axis: name, unit and additional factor."""
 
     signal: str = Field(examples=["RateOfTurn.RateX"], description='"Message.Signal"')
-    unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as the DBC says")
+    unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as stated in the DBC file")
     factor: Annotated[float, SCALE] = Field(
         1.0, description="factor that is applied last: a sign, a correction, or the size of a raw count"
     )
@@ -49,13 +49,14 @@ class Settings(SettingsModel):
     counter: str = Field(
         "",
         examples=["SampleTime.SampleTimeFine"],
-        description='"Message.Signal"; with join = "counter" the name of a signal that every message of a sample has',
+        description='sample counter, "Message.Signal"; with join = "counter": signal in all messages of a sample',
     )
     tick: Annotated[float, TICK_S] | None = Field(
-        None, examples=[1e-4], description="length of a count in s; absent: the counter counts samples"
+        None, examples=[1e-4], description="duration of one count in s; absent: the counter counts samples"
     )
     join: Literal["time", "counter"] = Field(
-        "time", description="frames that make a sample: frames that arrive together, or frames with equal counts"
+        "time",
+        description="frames that form a sample: frames that arrive together, or frames with equal counts",
     )
     window: Annotated[float, DELAY_S] = Field(
         0.0, description="time in s within which the frames of one sample arrive, at most half a sample period; 0 = any"
@@ -64,15 +65,17 @@ class Settings(SettingsModel):
         False, description="true: keep samples with missing frames; the axes of these frames are not measured"
     )
     j1939: bool | None = Field(
-        None, examples=[True], description="messages are identified by their parameter group; absent: as the DBC says"
+        None,
+        examples=[True],
+        description="true: identify messages by their parameter group; absent: as stated in the DBC file",
     )
     source: Annotated[int, SOURCE_ADDRESS] | None = Field(
-        None, examples=[128], description="J1939 source address; absent: the first sender that is received"
+        None, examples=[128], description="J1939 source address; absent: the sender of the first message"
     )
     not_available: bool | None = Field(
         None,
         examples=[True],
-        description="values in the top 2/256 of their range are not measured; absent: true for J1939 messages only",
+        description="true: values in the top 2/256 of their range count as not measured; absent: true for J1939 only",
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:

@@ -41,7 +41,7 @@ class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     sentence: Literal["auto", "VNIMU", "VNYMR"] = Field(
-        "auto", description="sentence to read; auto reads the first of the two that arrives"
+        "auto", description="sentence to read; auto: the sentence that arrives first"
     )
 
 

@@ -60,25 +60,32 @@ def _text_option(metavar: str, help_text: str) -> Any:
 
 JsonFile = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Result as JSON; - = standard output.", callback=_check_json_file),
+    typer.Option(metavar="FILE", help="Write the result as JSON; - = standard output.", callback=_check_json_file),
 ]
-Viewer = Annotated[
-    str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
+Viewer = Annotated[str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the viewer.")]
+KeyExpr = Annotated[
+    str, typer.Argument(metavar="KEYEXPR", help="Key expression of the devices to show, e.g. imu/NAME for one device.")
 ]
-KeyExpr = Annotated[str, typer.Argument(metavar="KEYEXPR", help="Keys to show; imu/NAME for one device.")]
 Connect = Annotated[
-    list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450; repeatable.")
+    list[str] | None,
+    typer.Option(metavar="ENDPOINT", help="Daemon or router to connect to, e.g. tcp/127.0.0.1:7450; repeatable."),
 ]
 ZenohFile = Annotated[
     Path | None,
-    typer.Option("--zenoh", metavar="FILE.json5", help="zenoh file: certificates, user and password, endpoints."),
+    typer.Option(
+        "--zenoh",
+        metavar="FILE.json5",
+        help="zenoh configuration file, e.g. with certificates, user and password, endpoints.",
+    ),
 ]
-Prefix = Annotated[str, typer.Option(metavar="KEY", help="Prefix of the keys of the daemon.")]
-DeviceName = Annotated[str | None, typer.Option(metavar="NAME", help="Device; needed if there are several.")]
+Prefix = Annotated[str, typer.Option(metavar="KEY", help="Prefix of the zenoh keys of the daemon.")]
+DeviceName = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name of the device; required if there are several devices.")
+]
 ModelRate = Annotated[
     float | None,
     typer.Option(
-        metavar="HZ", help="Sample rate; by default that of the model.", callback=make_range_callback(RATE_HZ)
+        metavar="HZ", help="Sample rate; by default the rate of the model.", callback=make_range_callback(RATE_HZ)
     ),
 ]
 Seconds = Annotated[
@@ -87,23 +94,32 @@ Seconds = Annotated[
 SimulationSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=make_range_callback(SEED)
+        metavar="N",
+        help="Seed of the random numbers; the same seed gives the same recording.",
+        callback=make_range_callback(SEED),
     ),
 ]
 ReportSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=make_range_callback(SEED)
+        metavar="N",
+        help="Seed of the random numbers; the same seed gives the same report.",
+        callback=make_range_callback(SEED),
     ),
 ]
 Inflation = Annotated[
-    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=make_range_callback(INFLATION))
+    float,
+    typer.Option(
+        metavar="F",
+        help="Factor by which N, B and K are multiplied, 1 or more.",
+        callback=make_range_callback(INFLATION),
+    ),
 ]
 TimeStep = Annotated[
     float | None,
     typer.Option(
         metavar="S",
-        help="Time step of the program that reads the parameters; by default that of the program or the sample period.",
+        help="Time step of the program that reads the parameters; by default its usual time step or the sample period.",
         callback=make_range_callback(DURATION_S),
     ),
 ]
@@ -111,14 +127,14 @@ CorrelationTime = Annotated[
     float | None,
     typer.Option(
         metavar="S",
-        help="kalman, gnss_ins_sim: correlation time of the process that represents B.",
+        help="Correlation time of the process that represents B, for the formats kalman and gnss_ins_sim.",
         callback=make_range_callback(DURATION_S),
     ),
 ]
 
 _UNITS = typer.Option(
     metavar="imu|datasheet|si",
-    help="Units of tables and plots: °/√h, with noise density in m°/s/√Hz, or rad/s/√Hz.",
+    help="Units of tables and plots: N in °/√h; with datasheet also in m°/s/√Hz; with si in rad/s/√Hz.",
 )
 Units = Annotated[str, _UNITS]
 ConfiguredUnits = Annotated[str | None, _UNITS]
@@ -132,13 +148,13 @@ LENGTH_OPTIONS = {
             callback=make_range_callback(RATE_HZ),
         ),
     ],
-    "last": _text_option("S", "Use only the last S seconds of the recording; also 1h, 1d."),
+    "last": _text_option("S", "Use only the last part of the recording: S seconds, or e.g. 1h or 1d."),
 }
 """Options for the rate and the length of a recording."""
 READING_OPTIONS = {
     "topic": _text_option(
         "NAME",
-        "Topic of a ROS bag or of an autopilot's log; by default its only IMU. A+B joins gyroscope and accelerometer.",
+        "Topic of a ROS bag or an autopilot log; by default the only topic with IMU data. A+B joins two topics.",
     ),
     "columns": _text_option(
         "Q=COLUMN,…", "Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name."

@@ -67,7 +67,7 @@ class AllanAxis(DeviationCurve, frozen=True):
     """Allan deviations of one axis."""
 
     recent: DeviationCurve | UnsetType = UNSET
-    """Deviations over the last max(10 s, 16 τ) of samples."""
+    """Deviations of the samples in the last 16 τ, but at least in the last 10 s."""
 
 
 class CoefficientValue(msgspec.Struct, frozen=True):
@@ -82,7 +82,7 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     status: str = ""
     """``estimated``, ``upper_bound`` or ``unestimated``."""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """Other coefficient, K or R, that explains the data equally well. Unset if the data distinguish K from R."""
+    """Other coefficient, K or R, that explains the data equally well. Absent if the data distinguish K from R."""
 
 
 class SlidingWindowMessage(
@@ -94,7 +94,7 @@ class SlidingWindowMessage(
     """Base class of messages with results that are computed from the sliding window."""
 
     rate_hz: float | None = None
-    """Sample rate from which the averaging times are computed [Hz]."""
+    """Sample rate that is used to compute the averaging times [Hz]."""
     window_s: float | None = None
     """Length of the sliding window [s]."""
     filled_s: float | None = None
@@ -109,7 +109,7 @@ class AllanMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.A
     """Averaging times [s]."""
     axes: dict[str, AllanAxis]
     poorly_fitted_axes: list[str] | UnsetType = UNSET
-    """Axes whose fitted coefficients do not describe the deviations. Unset if there are none."""
+    """Axes whose Allan deviations are not described by the fitted coefficients. Absent if there are no such axes."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
@@ -210,29 +210,29 @@ class TauRange(msgspec.Struct, frozen=True):
     """First and last averaging time of a range [s]."""
 
     tau: tuple[float, float]
-    """First and last averaging time of the difference [s]."""
+    """First and last averaging time at which the axis differs from the model [s]."""
 
 
 class AxisModelComparisonValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of the measured Allan deviation of one axis with the noise model."""
 
     agrees: bool | None = None
-    """True if the axis agrees with the noise model, based on a test with hysteresis. None before the first decision."""
+    """True if the axis agrees with the model, based on a test with hysteresis. ``null`` before the first decision."""
     gap: float
-    """Largest difference between measurement and model in standard deviations."""
+    """Largest difference between measured and modelled Allan variance, in standard deviations."""
     where: TauRange
     ratio: float | None = None
-    """Measured deviation divided by that of the model, where the difference is largest."""
+    """Measured Allan deviation divided by the Allan deviation of the model, where the difference is largest."""
     null95: float | None = None
-    """Limit that the gap of this axis exceeds in 5 % of windows if the model is true."""
+    """Limit that the gap of this axis exceeds in 5 % of the windows if the model is true."""
     threshold: float | None = None
-    """Limit that the gap of any axis exceeds in 1 % of windows if the model is true."""
+    """Limit that the largest gap of all axes exceeds in 1 % of the windows if the model is true."""
     measured: Floats | None = None
     """Measured Allan deviations, one for each averaging time."""
     model: Floats | None = None
-    """Allan deviations of the model."""
+    """Allan deviations of the model, one for each averaging time."""
     z: Floats | None = None
-    """Differences in standard deviations."""
+    """Differences between measurement and model in standard deviations, one for each averaging time."""
 
 
 class ModelGapMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema_name()):
@@ -264,15 +264,15 @@ class AxisBiasPrediction(msgspec.Struct, frozen=True):
     error: float | None
     """Standard error of the mean bias."""
     multi_step: PredictionInterval | None
-    """Bias predicted from the temperature alone."""
+    """Bias that is predicted from the temperature alone."""
     one_step: PredictionInterval | None
-    """Bias predicted from the temperature and the mean bias of the preceding interval."""
+    """Bias that is predicted from the temperature and from the mean bias in the preceding interval."""
     model: str | None
     """Form of the thermal model."""
     slope: float | None
-    """Slope of the model at the temperature of the interval, per °C."""
+    """Mean slope of the model in the temperature range of the fit, after all lags have settled [rad/s/°C, m/s²/°C]."""
     text: str
-    """Reason why a prediction is missing."""
+    """Reason for a missing prediction."""
 
 
 class ThermalPredictionMessage(
@@ -338,15 +338,15 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
     kind: str
     """Kind of the event."""
     axis: str | None = None
-    """Axis that the event concerns."""
+    """Axis on which the event occurred. ``null`` if the event concerns the whole device."""
     what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     """Values of the affected coefficients, such as the values before and after a change."""
     since: float | None = None
-    """Unix time at which the condition that the event reports began [s]."""
+    """Unix time at which the reported condition began [s]."""
     sigma: float | None = None
-    """Size of the change in standard errors."""
+    """Size of the reported change, in standard errors."""
     text: str
-    """Sentence for the user."""
+    """Description of the event for users."""
 
     @classmethod
     def _convert(cls, t: float | None, result: Event) -> dict[str, Any]:
@@ -387,7 +387,7 @@ class LatencyPercentiles(msgspec.Struct, frozen=True):
     p50: float | None = None
     """Median time from the receipt of a sample to its publication, over the last second [s]."""
     p99: float | None = None
-    """99 % quantile of this time [s]."""
+    """99 % quantile of the time from the receipt of a sample to its publication, over the last second [s]."""
 
 
 class StatusMessage(
@@ -403,22 +403,22 @@ class StatusMessage(
     state: str
     """``running``, ``waiting``, ``lost`` or ``ended``."""
     rate_hz: float | None = None
-    """Measured sample rate [Hz]. ``null`` until it is known."""
+    """Measured sample rate [Hz]. ``null`` until the rate is known."""
     received: Count
     """Number of received samples."""
     lost: Count
-    """Number of samples that are missing on the wire, or whose frame came too late."""
+    """Number of samples that did not arrive, or that arrived too late."""
     bad: Count
-    """Number of samples that are rejected because of a failed check or an impossible value."""
+    """Number of samples that were rejected because of a failed check or an impossible value."""
     overflowed: Count = 0
-    """Number of samples that were overwritten before the service took them."""
+    """Number of samples that were overwritten in the ring buffer before they were processed."""
     latency: LatencyPercentiles = LatencyPercentiles()
     memory_bytes: Count = 0
-    """Memory of the whole process [bytes]."""
+    """Memory that the whole process uses [bytes]."""
     outputs: dict[str, str] = msgspec.field(default_factory=dict)
     """State of each output: ``ok`` or a description of the problem."""
     uptime_s: float = 0.0
-    """Time since the start of the device [s]."""
+    """Time since the daemon started to read the device [s]."""
     repeated: Count = 0
     """Number of samples that were received twice and discarded."""
     late: Count = 0
@@ -426,11 +426,11 @@ class StatusMessage(
     moving: bool = False
     """True while the device is in motion."""
     moved: Count = 0
-    """Number of samples during motion."""
+    """Number of samples that were taken during motion."""
     crossed: tuple[str, ...] = ()
-    """Limits that are crossed now, for example ``gz N``."""
+    """Limits that are crossed at present, for example ``gz N``."""
     text: str = ""
-    """Problem with the device, or an empty string."""
+    """Description of a problem with the device, or an empty string."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
@@ -468,7 +468,7 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema_nam
 
     topic = topics.RESET
     text: str
-    """Sentence for the user."""
+    """Result of the command, described for users."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: str) -> dict[str, Any]:

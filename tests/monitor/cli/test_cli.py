@@ -1619,14 +1619,17 @@ def test_failed_thread_is_reported_in_one_line(
             ("simulate", "m.toml", "--seconds", "1"),
             "Missing option '--out' (FILE): Recording to write: .csv, .csv.gz",
         ),
-        (("simulate", "m.toml"), "Missing option '--seconds' (S): Length in seconds"),
-        (("compensate", "a.csv"), "Missing option '--out' (FILE): Recording without drift"),
+        (("simulate", "m.toml"), "Missing option '--seconds' (S): Duration in s"),
+        (("compensate", "a.csv"), "Missing option '--out' (FILE): Compensated recording to write"),
         (("reconcile", "a.csv"), "Missing option '--out' (DIR): Folder for the report"),
         (
             ("thermal", "predict", "a.csv"),
             "Missing option '--model' (MODEL.json): Model file that thermal fit has",
         ),
-        (("analyze",), "Missing argument 'RECORDING': File, or folder of segments. See imu-monitor analyze --help"),
+        (
+            ("analyze",),
+            "Missing argument 'RECORDING': File of a recording, or folder of segments. See imu-monitor analyze --help",
+        ),
         (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
         (
             ("analyze", "a.csv", "--xyz"),

@@ -88,7 +88,7 @@ class Settings(SettingsModel):
     pattern: Annotated[str, checked_by(_check_pattern)] = Field(
         "",
         examples=["GyX = (?P<gx>[-.0-9]+).*AcX = (?P<ax>[-.0-9]+)"],
-        description="regular expression (RE2) with groups named as the columns, instead of columns",
+        description="instead of columns: regular expression (RE2) whose groups are named as the columns",
     )
     preset: Literal["none", "mpu6050_raw"] = Field(
         "none",
@@ -123,12 +123,12 @@ class Settings(SettingsModel):
     comment: str = Field("#", description='lines that begin with this text are skipped; "" = none')
     header: Annotated[int, HEADER_LINES] = Field(0, description="number of lines to skip after the link was opened")
     first_line: Literal["drop", "keep"] = Field(
-        "drop", description="drop: the first line after the link was opened is skipped, since its start may be missing"
+        "drop", description="drop: skip the first line after the link was opened, because its start can be missing"
     )
     nmea: bool = Field(False, description="true: lines have the form $fields*CC with a checksum")
     time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="unit of column t, the clock of the device")
     counter_modulus: Annotated[int, COUNTER_MODULUS] = Field(
-        1 << 32, description="counts after which column counter starts again at 0"
+        1 << 32, description="number of counts after which the column counter starts again at 0"
     )
 
     def find_conflicting_settings(self) -> Iterator[Conflict]:

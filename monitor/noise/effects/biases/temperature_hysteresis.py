@@ -28,7 +28,7 @@ class TemperatureHysteresis(BiasWithoutSpectrum):
     height: float = parameter_field("rad/s", "m/s²", signed=True)
     reversal: float = parameter_field("°C", positive=True)
 
-    description: ClassVar[str] = "The bias differs between rising and falling temperature."
+    description: ClassVar[str] = "At the same temperature, the bias differs between heating and cooling."
     uses_temperature: ClassVar[bool] = True
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> RunningSource:

@@ -31,7 +31,7 @@ class Narrowband(Source):
     frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
     bandwidth: float = parameter_field("Hz", positive=True)
 
-    description: ClassVar[str] = "A nearby resonance adds an oscillation with a randomly varying amplitude."
+    description: ClassVar[str] = "A resonance near the sensor adds an oscillation with a randomly varying amplitude."
 
     @property
     def _decay(self) -> complex:

@@ -23,7 +23,9 @@ class NoiseStep(WhiteNoiseGain):
     time: float = parameter_field("s")
     ratio: float = parameter_field("1")
 
-    description: ClassVar[str] = "The standard deviation of the white noise changes once by a factor."
+    description: ClassVar[str] = (
+        "The standard deviation of the white noise changes by a constant factor at one point in time."
+    )
 
     def start_gain(self, rate_hz: float, rng: np.random.Generator) -> RunningGain:
         """Start a gain with a step. ``time`` is relative to the first sample of the stream."""

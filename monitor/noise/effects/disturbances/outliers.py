@@ -24,7 +24,7 @@ class Outliers(Source):
     fraction: float = parameter_field("1", maximum=1.0)
     scale: float = parameter_field("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Individual samples deviate strongly from their neighbours."
+    description: ClassVar[str] = "Individual samples deviate strongly from the samples before and after them."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum of white noise with the same mean square as the errors."""

@@ -48,7 +48,7 @@ class WanderingLine(Source):
     correlation_time: float = parameter_field("s", positive=True)
     phase: float | None = parameter_field("rad", signed=True, optional=True)
 
-    description: ClassVar[str] = "The frequency of an oscillation with constant amplitude wanders."
+    description: ClassVar[str] = "The frequency of an oscillation with a constant amplitude varies randomly."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the mean spectrum, and the Allan variance by numerical integration."""

@@ -20,7 +20,9 @@ class AngleRandomWalk(Source):
 
     N: float = parameter_field("rad/√s", "m/s/√s")
 
-    description: ClassVar[str] = "White noise of the rate averages out with the square root of the averaging time."
+    description: ClassVar[str] = (
+        "The rate contains white noise, so the error of a mean decreases with the square root of the averaging time."
+    )
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum N² and the Allan variance N²/τ."""

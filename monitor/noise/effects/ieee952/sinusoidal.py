@@ -27,7 +27,9 @@ class Sinusoidal(Source):
     frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
     phase: float | None = parameter_field("rad", signed=True, optional=True)
 
-    description: ClassVar[str] = "A steady oscillation adds a line to the spectrum and waves to the Allan deviation."
+    description: ClassVar[str] = (
+        "A steady oscillation causes a line in the spectrum and ripples in the Allan deviation."
+    )
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum with one line and no density."""

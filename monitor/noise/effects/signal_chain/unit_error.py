@@ -24,7 +24,7 @@ class UnitError(Transform):
     factor: float = parameter_field("1", positive=True)
 
     description: ClassVar[str] = (
-        "All output values are multiplied by a constant factor, as if they were in a wrong unit."
+        "All output values are multiplied by a constant factor, because they are in a wrong unit."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
