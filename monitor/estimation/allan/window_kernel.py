@@ -443,11 +443,12 @@ def drift_slopes_by_axis_and_tau(memory: Ints, taus: int, lengths: Ints, slope: 
         Output array for the result of ``mean_rate_slope`` in units of the axis.
     """
     w = compiled_view_window_arrays(memory, taus)
+    newest = w.state[NEWEST]
     for axis in range(AXES):
-        n, newest = lengths[axis], w.state[NEWEST]
-        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, n, axis) / w.scaling[axis]
-        for i in range(slopes.shape[1]):
-            bend = mean_rate_slope(w.phase, w.missing, newest, n, w.factors[i], axis)
+        slope[axis] = integer_slope_from_thirds(w.phase, w.missing, newest, lengths[axis], axis) / w.scaling[axis]
+    for i in range(slopes.shape[1]):
+        for axis in range(AXES):  # all axes read the same cache lines
+            bend = mean_rate_slope(w.phase, w.missing, newest, lengths[axis], w.factors[i], axis)
             slopes[axis, i] = bend / w.scaling[axis]
 
 
@@ -465,14 +466,16 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     middle = _reference_level(phase, missing, newest, n, axis)
     if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
-    stride = max(1, m // BEND_POINTS)
+    stride, has_gaps = max(1, m // BEND_POINTS), missing[last] != missing[first]
     total = 0.0
     for k in range(0, m, stride):
         at0, at1 = ring_row(newest - k, places) * LANES + axis, ring_row(newest - m - k, places) * LANES + axis
         at2 = ring_row(newest - n + 2 * m - 1 - k, places) * LANES + axis
         at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
-        absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
-        total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
+        change = phase[at0] - phase[at1] - phase[at2] + phase[at3]
+        if has_gaps:
+            change += middle * (missing[at0] - missing[at1] - missing[at2] + missing[at3])
+        total += float(change)
     points = (m + stride - 1) // stride
     # The number of second differences is n + 1 − 2m.
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

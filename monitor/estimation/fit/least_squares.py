@@ -188,24 +188,36 @@ def solve_on_subset(normal: Floats, right_side: Floats, subset: int, solution: F
     bool
         False if the matrix of the subset is singular.
     """
-    terms, factor, scaled, n = np.empty(5, np.int64), np.empty((5, 5)), np.empty(5), 0
+    terms, scale, factor, scaled = np.empty(5, np.int64), np.empty(5), np.empty((5, 5)), np.empty(5)
     for a in range(5):
         solution[a] = 0.0
-        if subset >> a & 1:
-            terms[n] = a
-            n += 1
-    for k in range(n):
-        a = terms[k]
-        scaled[k] = right_side[a] / np.sqrt(normal[a, a])
-        for j in range(k + 1):
-            b = terms[j]
-            factor[k, j] = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
-    if not _factorize(factor, n, SINGULAR_NORMAL):
+    n = _factorize_on_subset(normal, subset, terms, scale, factor)
+    if n < 0:
         return False
+    for k in range(n):
+        scaled[k] = right_side[terms[k]] * scale[k]
     _substitute(factor, n, scaled)
     for k in range(n):
-        solution[terms[k]] = scaled[k] / np.sqrt(normal[terms[k], terms[k]])
+        solution[terms[k]] = scaled[k] * scale[k]
     return True
+
+
+@compiled
+def _factorize_on_subset(normal: Floats, subset: int, terms: Ints, scale: Floats, factor: Floats) -> int:
+    """Compute the Cholesky factor of the correlation matrix of a subset of the coefficients.
+
+    ``terms`` receives the indices of the coefficients, and ``scale`` the factors that normalize them. The result is the
+    number of coefficients, or -1 if the matrix is singular.
+    """
+    n = 0
+    for a in range(5):
+        if subset >> a & 1:
+            terms[n], scale[n] = a, 1.0 / np.sqrt(normal[a, a])
+            n += 1
+    for k in range(n):
+        for j in range(k + 1):
+            factor[k, j] = normal[terms[k], terms[j]] * scale[k] * scale[j]
+    return n if _factorize(factor, n, SINGULAR_NORMAL) else -1
 
 
 @compiled
@@ -260,7 +272,7 @@ def invert_on_subset(normal: Floats, subset: int, inverse: Floats) -> bool:
         Matrix Xᵀ V⁻¹ X of the normal equations.
     subset : int
         Bit set of the selected coefficients.
-    inverse : ndarray of float64, shape (4, 4)
+    inverse : ndarray of float64, shape (5, 5), or (4, 4) if the subset does not contain R
         Output array for the inverse, which is zero outside the subset.
 
     Returns
@@ -268,13 +280,15 @@ def invert_on_subset(normal: Floats, subset: int, inverse: Floats) -> bool:
     bool
         False if the selected part of the normal matrix is singular.
     """
-    unit, solution = np.empty(5), np.empty(5)
-    for a in range(NOISES):
-        for b in range(5):
-            unit[b] = 1.0 if b == a else 0.0
-            solution[b] = 0.0
-        if subset >> a & 1 and not solve_on_subset(normal, unit, subset, solution):
-            return False
-        for b in range(NOISES):
-            inverse[b, a] = solution[b]
-    return True
+    terms, scale, factor, column = np.empty(5, np.int64), np.empty(5), np.empty((5, 5)), np.empty(5)
+    for a in range(inverse.shape[0]):
+        for b in range(inverse.shape[0]):
+            inverse[a, b] = 0.0
+    n = _factorize_on_subset(normal, subset, terms, scale, factor)
+    for j in range(n):
+        for k in range(n):
+            column[k] = 1.0 if k == j else 0.0
+        _substitute(factor, n, column)
+        for k in range(n):
+            inverse[terms[k], terms[j]] = column[k] * scale[k] * scale[j]
+    return n >= 0

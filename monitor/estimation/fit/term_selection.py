@@ -31,7 +31,6 @@ from monitor.estimation.fit.least_squares import (
     compute_weights,
     invert_on_subset,
     nonzero_term_bits,
-    solve_on_subset,
 )
 
 MAX_THETA_CHANGE: Final = 0.4
@@ -40,6 +39,8 @@ MAX_THETA_SIGMA: Final = 1.0
 """Largest change of θ, in standard deviations, for which the linear map is kept."""
 DETECTABLE_SIGMA: Final = 3.0
 """Size of a squared coefficient, in σ, at which the noise term is detected."""
+ALL_NOISES: Final = 2**NOISES - 1
+"""Bit set of the coefficients Q, N, B and K."""
 
 
 @compiled
@@ -65,10 +66,15 @@ def select_terms(
     """
     count = NOISES if straight else 5
     tests, gain = TermTests(np.zeros(5), np.empty(NOISES), np.empty(NOISES)), np.zeros((5, rows.size))
+    inverse = np.empty((5, 5))
+    known = invert_on_subset(problem.normal, ALL_NOISES, inverse)
     for a in range(count):
-        if not _map_to_term(a, problem, rows, gain[a]):
+        if a == R:
+            known = invert_on_subset(problem.normal, ALL_NOISES | 1 << R, inverse)
+        if not known:
             terms.entered[a] = False
             continue
+        _map_to_term(a, inverse, problem, rows, gain[a])
         tests.estimate[a] = _estimate(gain[a], problem, rows)
     forms = _variance_forms(0, count, gain, rows, terms.theta, problem.covariance)
     for a in range(NOISES):
@@ -130,7 +136,7 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
         problem.level, problem.stretch, problem.columns, problem.covariance, problem.ignored_direction,
         np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
-    supposed, gain = np.empty(5), np.empty((1, rows.size))
+    supposed, gain, inverse = np.empty(5), np.empty((1, rows.size)), np.empty((5, 5))
     for a in range(NOISES):
         if terms.status[a] != 1 or tests.absent_variance[a] <= 0.0:
             continue
@@ -139,7 +145,8 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
         supposed[a] = max(tests.estimate[a], 0.0) + DETECTABLE_SIGMA * np.sqrt(tests.absent_variance[a])
         compute_weights(own, rows, supposed, False)
         compute_normal_equations(own, rows)
-        if _map_to_term(a, own, rows, gain[0]):
+        if invert_on_subset(own.normal, ALL_NOISES, inverse):
+            _map_to_term(a, inverse, own, rows, gain[0])
             c = _variance_forms(a, a + 1, gain, rows, terms.theta, own.covariance)[0]
             estimate = max(_estimate(gain[0], own, rows), 0.0)
             terms.hi[a] = confidence_interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
@@ -154,21 +161,17 @@ def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
 
 
 @compiled
-def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> bool:
+def _map_to_term(a: int, inverse: Floats, problem: LeastSquares, rows: Ints, gain: Floats) -> None:
     """Compute the linear map from the Allan variances to the unconstrained estimate of coefficient a.
 
-    Return False if the coefficients cannot be distinguished.
+    ``inverse`` is the inverse of the normal matrix.
     """
-    unit, solution, weighted = np.zeros(5), np.empty(5), problem.weighted
-    unit[a] = 1.0
-    if not solve_on_subset(problem.normal, unit, (2**NOISES - 1) | (1 << a), solution):
-        return False
+    weighted, stretch = problem.weighted, problem.stretch
     for k in range(rows.size):
         x = 0.0
         for c in range(5):
-            x += solution[c] * weighted[rows[k], c]
-        gain[k] = x * problem.stretch[rows[k]]
-    return True
+            x += inverse[c, a] * weighted[rows[k], c]
+        gain[k] = x * stretch[rows[k]]
 
 
 @compiled
@@ -286,7 +289,7 @@ def store_linear_map(
         for b in range(5):
             maps.normal[axis, a, b] = problem.normal[a, b]
     subset = nonzero_term_bits(output.theta[axis])
-    if not invert_on_subset(problem.normal, 2**NOISES - 1, maps.whole[axis]):
+    if not invert_on_subset(problem.normal, ALL_NOISES, maps.whole[axis]):
         return False
     if not invert_on_subset(problem.normal, subset, maps.inverse[axis]):
         return False
