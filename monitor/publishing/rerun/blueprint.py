@@ -50,21 +50,22 @@ DESCRIPTIONS: Final = {
     "overview": "**Are they healthy?** One row for each device, with its state and its lost and bad samples.",
     "coefficients": "**What is its noise now?** Q quantization, N white noise, B bias instability, K random walk and R "
     "ramp, with 95 % intervals.",
-    "events": "**Has it changed?** Changes of the noise, losses of samples and faults of the link, with UTC times.",
+    "events": "**Has it changed?** Changes of noise and bias, lost samples and faults of the link, with UTC times.",
     "allan": "**Allan deviation:** noise (up) that remains after averaging for a time (right); lower is better. "
-    "Orange ● x, green □ y, blue △ z, line fit, thin lines 95 %, ring N, B or K, dashes model, grey line poor fit.",
-    "coefficients/[NBK]": "**N, B, K over time:** a step is a change of the noise, and thin lines are 95 % intervals.",
+    "Orange ● x, green □ y, blue △ z, line fit, thin lines 95 %, rings N, 0.664 B and K, dashes model, grey poor fit.",
+    "coefficients/[NBK]": "**N, B, K over time:** a diamond marks a change, and thin lines are 95 % intervals.",
     "samples": "**Samples:** the last 30 seconds as measured.",
     "temperature": "**Temperature:** as the sensor reports it.",
     "dynamic/..": "**Heat maps:** time runs to the right and averaging time upwards; vermilion is noisier, and blue is "
     "quieter, than the median.",
-    "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device.",
-    "thermal/..": "**Bias:** mean of each interval in colour, prediction from temperature in grey, and its 95 % "
-    "interval in thin lines.",
-    "compensated": "**Rates:** measured rate in grey, and rate without the predicted drift in colour.",
+    "gap": "**Gap to the model:** above the grey threshold, the model does not describe the device. A lasting "
+    "difference raises the gap.",
+    "thermal/..": "**Bias:** mean of each interval in colour, prediction from temperature and last interval in grey, "
+    "and its 95 % interval in thin lines.",
+    "compensated": "**Rates:** measured rate in grey; smoothed rate without the predicted drift in colour.",
     "drift/g.": "**Drift:** means at rest in colour, prediction in grey, and its 95 % interval in thin lines.",
     "innovation/g.": "**Innovation:** differences of the means from their predictions, mostly within ±2 σ.",
-    "drift": "**Drift models:** predicted drift of each gyroscope, and its ARMA model with the coefficients φ and θ.",
+    "drift": "**Drift of the gyros:** predicted drift of each gyroscope, and its ARMA model with coefficients φ and θ.",
 }
 """Sentence that describes each kind of panel; the keys are regular expressions for the end of the path of its view."""
 
