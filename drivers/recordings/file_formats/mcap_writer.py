@@ -17,7 +17,13 @@ from drivers.data_types import AXES, Ints, times_to_ns
 from drivers.errors import RecordingError
 from drivers.host.extras import require_extra
 from drivers.recordings import table
-from drivers.recordings.file_formats.ros_message_arrays import IMU_TYPE, NOT_PROVIDED, SECOND_NS, TEMPERATURE_TYPE
+from drivers.recordings.file_formats.ros_message_arrays import (
+    IMU_TYPE,
+    NOT_PROVIDED,
+    SECOND_NS,
+    TEMPERATURE_TYPE,
+    encode_messages,
+)
 
 IMU_TOPIC: Final = "/imu/data"
 TEMPERATURE_TOPIC: Final = "/imu/temperature"
@@ -46,16 +52,16 @@ def open_mcap_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendC
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    messages = _MessageFactory(store.types)
     with TemporaryDirectory(dir=path.parent, prefix=f".{whole.name}-") as folder:
         bag = Path(folder) / "bag"  # rosbags writes a folder with the MCAP file and its metadata
         writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
-            imu = writer.add_connection(IMU_TOPIC, IMU_TYPE, typestore=store)
-            thermometer = None
+            topics: list[tuple[str, str, tuple[str, ...]]] = [(IMU_TOPIC, IMU_TYPE, AXES)]
             if "temperature" in names:
-                thermometer = writer.add_connection(TEMPERATURE_TOPIC, TEMPERATURE_TYPE, typestore=store)
+                topics.append((TEMPERATURE_TOPIC, TEMPERATURE_TYPE, ("temperature",)))
+            connections = [writer.add_connection(topic, kind, typestore=store) for topic, kind, _ in topics]
+            templates = [bytes(store.serialize_cdr(_empty_message(store.types, kind), kind)) for _, kind, _ in topics]
             newest_ns = -1
 
             def append_rows(columns: table.Columns) -> None:
@@ -65,14 +71,11 @@ def open_mcap_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendC
                 log_ns = _increasing_times(t_ns, newest_ns)
                 newest_ns = int(log_ns[-1])
                 absent = np.full(len(stamps), np.nan)
-                rows = np.column_stack([columns.get(axis, absent) for axis in AXES]).tolist()
-                for time_ns, stamp, row in zip(log_ns.tolist(), stamps.tolist(), rows, strict=True):
-                    writer.write(imu, time_ns, store.serialize_cdr(messages.imu(stamp, row), IMU_TYPE))
-                if thermometer is not None:
-                    values = columns["temperature"].tolist()
-                    for time_ns, stamp, value in zip(log_ns.tolist(), stamps.tolist(), values, strict=True):
-                        data = store.serialize_cdr(messages.temperature(stamp, value), TEMPERATURE_TYPE)
-                        writer.write(thermometer, time_ns, data)
+                for (_, kind, fields), connection, template in zip(topics, connections, templates, strict=True):
+                    values = np.column_stack([columns.get(name, absent) for name in fields])
+                    messages = encode_messages(template, kind, stamps, values)
+                    for time_ns, message in zip(log_ns.tolist(), messages, strict=True):
+                        writer.write(connection, time_ns, message)
 
             yield append_rows
         os.replace(bag / f"{bag.name}.mcap", path)
@@ -112,38 +115,11 @@ def _increasing_times(t_ns: Ints, newest_ns: int) -> Ints:
     return result
 
 
-class _MessageFactory:
-    """Factory of ROS 2 messages."""
-
-    def __init__(self, types: Any) -> None:
-        self._time = types["builtin_interfaces/msg/Time"]
-        self._header = types["std_msgs/msg/Header"]
-        self._imu = types[IMU_TYPE]
-        self._temperature = types[TEMPERATURE_TYPE]
-        self._vector = types["geometry_msgs/msg/Vector3"]
-        self._orientation = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        self._not_provided = np.array([NOT_PROVIDED, *[0.0] * 8])
-        self._unknown = np.zeros(9)
-
-    def imu(self, stamp: Sequence[int], values: Sequence[float]) -> Any:
-        """Return a message of type ``sensor_msgs/Imu`` with six values in the order of AXES."""
-        gyro, accel = values[:3], values[3:]
-        return self._imu(
-            self._make_header(stamp),
-            self._orientation,
-            self._not_provided,
-            self._vector(*gyro),
-            self._covariance(gyro),
-            self._vector(*accel),
-            self._covariance(accel),
-        )
-
-    def temperature(self, stamp: Sequence[int], value: float) -> Any:
-        """Return a message of type ``sensor_msgs/Temperature``."""
-        return self._temperature(self._make_header(stamp), value, 0.0)
-
-    def _make_header(self, stamp: Sequence[int]) -> Any:
-        return self._header(self._time(*stamp), FRAME)
-
-    def _covariance(self, values: Sequence[float]) -> Any:
-        return self._not_provided if all(value != value for value in values) else self._unknown
+def _empty_message(types: Any, kind: str) -> Any:
+    """Return a message without a stamp and without values. Its covariances are unknown."""
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), FRAME)
+    if kind == TEMPERATURE_TYPE:
+        return types[kind](header, 0.0, 0.0)
+    orientation = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    zero, unknown = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(9)
+    return types[kind](header, orientation, np.array([NOT_PROVIDED, *[0.0] * 8]), zero, unknown, zero, unknown)

@@ -1,4 +1,4 @@
-"""Decoding of ROS messages of type ``sensor_msgs/Imu`` and ``sensor_msgs/Temperature``, many messages at once.
+"""Decoding and encoding of many ROS messages of type ``sensor_msgs/Imu`` or ``sensor_msgs/Temperature`` at once.
 
 Both types begin with a header: the time stamp, and the text ``frame_id`` with its length. All other fields are float64
 at fixed offsets after the text. Consecutive messages of a topic usually contain the same text, so their bytes can be
@@ -88,6 +88,35 @@ def decode_messages(block: Sequence[bytes], message_type: str, cdr: bool) -> tup
     values[numbers[:, GYRO_COVARIANCE] == NOT_PROVIDED, :3] = np.nan
     values[numbers[:, ACCEL_COVARIANCE] == NOT_PROVIDED, 3:] = np.nan
     return stamps_ns, values
+
+
+def encode_messages(template: bytes, message_type: str, stamps: Ints, values: Floats) -> list[bytes]:
+    """Encode ROS 2 messages.
+
+    A quantity of which all values are NaN is marked as not provided.
+
+    Parameters
+    ----------
+    template
+        Message that contains all fields except the stamp and the values.
+    message_type
+        Key of NUMBERS.
+    stamps
+        [n, 2] header stamps as seconds and nanoseconds.
+    values
+        [n, 6] angular rates in rad/s and accelerations in m/s², or [n, 1] temperatures in °C.
+    """
+    rows = np.frombuffer(bytearray(template * len(stamps)), _message_layout(template, message_type, cdr=True))
+    rows["sec"], rows["nanosec"] = stamps.T
+    numbers = rows["numbers"]
+    if message_type == TEMPERATURE_TYPE:
+        numbers[:, :1] = values
+    else:
+        numbers[:, GYRO], numbers[:, ACCEL] = values[:, :3], values[:, 3:]
+        for first, columns in ((GYRO_COVARIANCE, values[:, :3]), (ACCEL_COVARIANCE, values[:, 3:])):
+            numbers[np.isnan(columns).all(axis=1), first] = NOT_PROVIDED
+    data = rows.tobytes()
+    return [data[at : at + len(template)] for at in range(0, len(data), len(template))]
 
 
 def _message_layout(data: bytes, message_type: str, cdr: bool) -> np.dtype[Any]:
