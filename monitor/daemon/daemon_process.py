@@ -129,7 +129,8 @@ class DaemonProcess:
             if now_s >= status_s:
                 status_s = now_s + STATUS_INTERVAL_S
                 self._publish_status()
-            self._finish_round()
+            for output in self.outputs:
+                output.finish_round()
             if self._has_ended() or (until_s is not None and now_s >= until_s):
                 return
             if self._reload_asked:
@@ -185,10 +186,6 @@ class DaemonProcess:
         """Apply a change of the configuration to the devices, and call ``_adopt``."""
         raise NotImplementedError
 
-    def _finish_round(self) -> None:
-        for output in self.outputs:
-            output.finish_round()
-
     # --- stop and reload
 
     def _close(self) -> None:
@@ -196,7 +193,6 @@ class DaemonProcess:
         try:
             self._stop_devices()
         finally:
-            self._finish_round()
             exporters = (self.metrics, self.influx, self.ros2, self.viewer, self.zenoh)
             for output in (self.hooks, *exporters, self.history):
                 if output is not None:

@@ -1,12 +1,9 @@
 """Output of the daemon that publishes results as zenoh messages.
 
 ``monitor.publishing.result_kinds`` lists the messages and drawings of each kind of result.
-
-The messages of one device are collected and sent together, because the sending thread of zenoh would otherwise wake up
-once for each message.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from drivers.data_types import Event, Ints, SampleBlock
 from drivers.zenoh.sample_message import encode_samples
@@ -18,29 +15,22 @@ from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Device
 
 
-class _EncodedMessage(NamedTuple):
-    topic: topics.ZenohTopic
-    device: str
-    payload: bytes
-
-
 class ZenohOutput(Output):
     """Output that publishes the results as zenoh messages."""
 
     def __init__(self, zenoh: ZenohPublisher) -> None:
         self._zenoh = zenoh
-        self._unsent: list[_EncodedMessage] = []  # messages of one device
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of samples as one msgpack message."""
-        self._send_later(topics.SAMPLES, device, encode_samples(device, received, samples, offset_ns))
+        self._zenoh.put(topics.SAMPLES, device, encode_samples(device, received, samples, offset_ns))
 
     def publish_drift_compensated_samples(
         self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
     ) -> None:
         """Publish a block of compensated samples as one msgpack message."""
         schema = topics.COMPENSATED.schema_name()
-        self._send_later(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
+        self._zenoh.put(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Publish a result as JSON messages."""
@@ -56,14 +46,7 @@ class ZenohOutput(Output):
 
     def set_alive(self, device: str, samples_arrive: bool) -> None:
         """Declare or remove the liveliness token of a device."""
-        self.finish_round()
         self._zenoh.set_alive(device, samples_arrive)
-
-    def finish_round(self) -> None:
-        """Send the collected messages."""
-        unsent, self._unsent = self._unsent, []
-        for message in unsent:
-            self._zenoh.put(*message)
 
     def add_device(self, device: Device) -> None:
         """Declare the zenoh keys of a device."""
@@ -71,15 +54,8 @@ class ZenohOutput(Output):
 
     def remove_device(self, device: str) -> None:
         """Remove the zenoh keys of a device."""
-        self.finish_round()
         self._zenoh.remove_device(device)
 
     def _publish_messages(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
         for message in kind_of(result).messages:
-            self._send_later(message.topic, device, message.from_result(device, unix_s, received, result).encode())
-
-    def _send_later(self, topic: topics.ZenohTopic, device: str, payload: bytes) -> None:
-        """Collect a message, after sending the collected messages of another device."""
-        if self._unsent and self._unsent[0].device != device:
-            self.finish_round()
-        self._unsent.append(_EncodedMessage(topic, device, payload))
+            self._zenoh.put(message.topic, device, message.from_result(device, unix_s, received, result).encode())
