@@ -155,10 +155,17 @@ class AllDevicesScene:
         static
             True if the components do not change with time.
         """
-        if not static:
-            self.entities.add(f"/{path}")
-            self._newest[path] = _LoggedEntity(self._log_time_s, time.monotonic(), entities)
-        self._stream.log(path, *entities, static=static)
+        if static:
+            self._stream.log(path, *entities, static=True)
+            return
+        drawn_s, known = self._log_time_s, self._newest.get(path)
+        if known is not None and known.unix_s > drawn_s:  # otherwise, the viewer would keep showing the older content
+            self.set_log_time(known.unix_s)
+        self.entities.add(f"/{path}")
+        self._newest[path] = _LoggedEntity(self._log_time_s, time.monotonic(), entities)
+        self._stream.log(path, *entities, static=False)
+        if self._log_time_s != drawn_s:
+            self.set_log_time(drawn_s)
 
     def log_static_text(self, path: str, text: str) -> None:
         """Log a Markdown text that does not change with time, unless the viewer already has this text.

@@ -80,15 +80,19 @@ def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> t
     rate_hz, seconds = options.rate, options.seconds
     more, tables = (text.replace("{folder}", str(folder)) for text in PARTS[part])
     tables += f"[service]\nworkers = {options.workers if options.workers != 'auto' else chr(34) + 'auto' + chr(34)}\n"
-    sensors = Sensors(folder, devices, rate_hz, WARM_UP_S + seconds, burst=options.burst)
     driver = "" if options.read_timeout is None else f"read_timeout = {options.read_timeout}"
-    published, busy, processors = PublishedMessages(), contextlib.ExitStack(), os.sched_getaffinity(0)
-    if options.share is not None:
-        busy.enter_context(run_busy_processes(round(1.0 / options.share) - 1, {min(processors)}))
-    daemon = Daemon(folder, devices, rate_hz, options.window, more, driver=driver, tables=tables)
-    if options.share is not None:
-        os.sched_setaffinity(0, processors - {min(processors)})
-    try:
+    published, processors = PublishedMessages(), os.sched_getaffinity(0)
+    slow = set() if options.share is None else {min(processors)}
+    with contextlib.ExitStack() as stack:
+        stack.callback(os.sched_setaffinity, 0, processors)
+        os.sched_setaffinity(0, processors - slow)
+        sensors = Sensors(folder, devices, rate_hz, WARM_UP_S + seconds, burst=options.burst)
+        stack.callback(sensors.close)
+        if slow:
+            stack.enter_context(run_busy_processes(round(1.0 / options.share) - 1, slow))
+        daemon = Daemon(folder, devices, rate_hz, options.window, more, driver=driver, tables=tables)
+        stack.callback(daemon.close)
+        os.sched_setaffinity(0, processors - slow)
         with open_session(daemon.port) as session, session.declare_subscriber("imu/**", published.take):
             wait_for(lambda: len(published.status) == devices, "the first status")
             sensors.start()
@@ -103,10 +107,6 @@ def run(devices: int, part: str, folder: Path, options: argparse.Namespace) -> t
             processes, memory_bytes = daemon.processes(), daemon.memory_bytes()
             threads, descriptors = (sum(map(count, processes)) for count in (_count_threads, _count_descriptors))
         written_ns = sensors.written_ns()
-    finally:
-        daemon.close()
-        busy.close()
-        sensors.close()
     late_ms = [(at_ns - written_ns[n - 1]) / 1e6 for n, at_ns in published.results if n > WARM_UP_S * rate_hz]
     counts = [published.total(name) for name in ("received", "bad", "lost", "overflowed")]
     balance, all_sent = sum(counts[:3]), devices * sent["each"]

@@ -172,31 +172,20 @@ def escape_markdown(text: str) -> str:
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", shown)
 
 
-def events_text(lines: Sequence[tuple[float, str, str]], last_change_s: float | None = None) -> str:
-    """Return the time of the last change of noise or bias, and a Markdown list of events, newest first.
-
-    Warnings and errors are bold.
+def events_text(lines: Sequence[tuple[float, str, str]]) -> str:
+    """Return a Markdown list of events, newest first. Warnings and errors are bold.
 
     Parameters
     ----------
     lines
         Unix time [s], level and Markdown text of each event, in order of time. The level of information is "".
-    last_change_s
-        Unix time [s] of the last detected change of noise or bias, or None if no change has been detected.
     """
-    times = [_format_time_of_year(at_s) for at_s, _, _ in lines]
+    times = [format_utc(at_s)[5:] for at_s, _, _ in lines]  # without the year, to save space
     shown = [
         f"- **{time} {level}** {text}" if level else f"- {time} {text}"
         for time, (_, level, text) in zip(times, lines, strict=True)
     ]
-    answer = "No change of noise or bias detected"
-    if last_change_s is not None:
-        answer = f"Last change of noise or bias: {_format_time_of_year(last_change_s)}"
-    return "\n".join([f"**{answer}**", "", *reversed(shown)])
-
-
-def _format_time_of_year(unix_s: float) -> str:
-    return format_utc(unix_s)[5:]  # without the year, to save space
+    return "\n".join(reversed(shown))
 
 
 def noise_text(estimate: Estimate, units: UnitSystem = DEFAULT_UNITS) -> str:

@@ -39,9 +39,6 @@ class HealthPanel(Panel):
         self.scene.entities.discard(f"/{self.entity_path('waiting')}")
         self._log_text("status", at_s, text)
         self.scene.repeat_unchanged_entities(self.device, at_s)
-        if self.device in devices:
-            events = self.scene.get_or_create_panel(self.device, EventsPanel)
-            events.log_answer_before_first_event(self.entity_path("events"), at_s)
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.get_or_create_panel("", AllDevicesTablePanel).log_table_of_all_devices(
                 at_s, overview_text(self.scene.healths)
@@ -83,14 +80,10 @@ WARNING_EVENTS: Final = frozenset({
     "clock_jumped",
 })  # fmt: skip
 """Kinds of events that are logged as warnings."""
-CHANGE_EVENTS: Final = frozenset({"noise_changed", "bias_stepped"})
-"""Kinds of events that report a change of the sensor."""
 
 
 class EventsPanel(Panel):
-    """List of events, newest first, below the time of the last change of noise or bias.
-
-    A diamond in the plot marks the new value of a changed noise coefficient.
+    """List of events, newest first. A diamond in the plot marks the new value of a changed noise coefficient.
 
     The list is a text. A Rerun log would cut long lines, and a viewer that joins late may not receive its old lines.
     """
@@ -98,7 +91,6 @@ class EventsPanel(Panel):
     def __init__(self, scene: "AllDevicesScene", device: str) -> None:
         super().__init__(scene, device)
         self._lines: list[tuple[float, str, str]] = []  # Unix time [s], level and text of each event, in order of time
-        self._last_change_s: float | None = None  # Unix time of the last change of noise or bias [s]
 
     def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
         """Add events to the lists, and mark changed noise coefficients in the plots."""
@@ -107,13 +99,12 @@ class EventsPanel(Panel):
         ]
         texts = [escape_markdown(one.text) for one in results]
         lines = list(zip(unix_s.tolist(), levels, texts, strict=True))
-        changes_s = [at_s for at_s, one in zip(unix_s.tolist(), results, strict=True) if one.kind in CHANGE_EVENTS]
         if self.scene.fleet or len(self.scene.devices) > 1:
             name = escape_markdown(self.device)
             named = [(at_s, level, f"{name}: {text}") for at_s, level, text in lines]
-            self.scene.get_or_create_panel("", EventsPanel).log_lines("overview/events", named, changes_s)
+            self.scene.get_or_create_panel("", EventsPanel).log_lines("overview/events", named)
         if self.device in self.scene.devices:
-            self.log_lines(self.entity_path("events"), lines, changes_s)
+            self.log_lines(self.entity_path("events"), lines)
             for at_s, event in zip(unix_s.tolist(), results, strict=True):
                 self._mark_changes(at_s, event)
 
@@ -124,21 +115,7 @@ class EventsPanel(Panel):
             events = [Event(one.kind, round(one.t_s * 1e9), one.text, one.axis, one.what) for one in stored]
             self.draw(np.array([one.t_s for one in stored]), events)
 
-    def log_answer_before_first_event(self, path: str, unix_s: float) -> None:
-        """Log that nothing has changed, unless the list of events has been logged.
-
-        Parameters
-        ----------
-        path
-            Path of the entity with the list.
-        unix_s
-            Present Unix time [s].
-        """
-        if f"/{path}" not in self.scene.entities:
-            self.scene.set_log_time(unix_s)
-            self.scene.log(path, markdown_document(events_text([])))
-
-    def log_lines(self, path: str, lines: Sequence[tuple[float, str, str]], changes_s: Sequence[float] = ()) -> None:
+    def log_lines(self, path: str, lines: Sequence[tuple[float, str, str]]) -> None:
         """Log the list of events after adding lines to it.
 
         Parameters
@@ -147,13 +124,10 @@ class EventsPanel(Panel):
             Path of the entity with the list.
         lines
             Unix time [s], level and Markdown text of each new event.
-        changes_s
-            Unix times [s] of the new events that report a change of noise or bias.
         """
-        self._last_change_s = max((one for one in (self._last_change_s, *changes_s) if one is not None), default=None)
         self._lines = sorted([*self._lines, *lines], key=lambda line: line[0])[-MAX_SHOWN_EVENTS:]
         self.scene.set_log_time(self._lines[-1][0])
-        self.scene.log(path, markdown_document(events_text(self._lines, self._last_change_s)))
+        self.scene.log(path, markdown_document(events_text(self._lines)))
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
         if event.axis is None:

@@ -78,6 +78,16 @@ def test_repeated_entity_does_not_replace_a_later_one(monkeypatch: pytest.Monkey
     assert stream.calls == [("left/events", T0 + 10.0)] * 2
 
 
+def test_event_found_late_replaces_the_repeated_list() -> None:
+    stream = LoggingCalls()
+    scene = viewer_scene.AllDevicesScene(stream)  # type: ignore[arg-type]
+    for at_s in (T0 + 20.0, T0 + 5.0):
+        scene.set_log_time(at_s)
+        scene.log("left/events", "text")
+    scene.log("left/other", "text")
+    assert stream.calls == [("left/events", T0 + 20.0)] * 2 + [("left/other", T0 + 5.0)]
+
+
 def test_static_text_is_logged_again_only_if_it_changes() -> None:
     stream = LoggingCalls()
     scene = viewer_scene.AllDevicesScene(stream)  # type: ignore[arg-type]
