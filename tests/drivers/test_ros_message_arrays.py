@@ -11,9 +11,11 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     IMU_TYPE,
     TEMPERATURE_TYPE,
     decode_messages,
+    encode_messages,
     iter_message_blocks,
 )
 from drivers.recordings.topic_selection import RecordedTopic
+from tests.support import ros2_messages
 from tests.support.ros_bags import imu_topic, temperature_topic
 
 T_NS = 1_763_700_000_123_456_789 + np.arange(6) * 5_000_001
@@ -63,6 +65,21 @@ def test_a_temperature() -> None:
     stamps_ns, numbers = decode_messages(messages, TEMPERATURE_TYPE, cdr=True)
     assert stamps_ns.tolist() == T_NS.tolist()
     assert numbers.tolist() == [[float(i)] for i in range(6)]
+
+
+def test_rosbags_decodes_the_encoded_messages() -> None:
+    (template, *_), _ = serialize(["imu"])
+    values = np.random.default_rng(3).normal(size=(3, 6))
+    values[1, :3], values[2, 4] = np.nan, np.nan  # no angular rates; one missing acceleration
+    stamps = np.array([[1_763_700_000, 123_456_789], [1_763_700_001, 0], [0, 999_999_999]])
+    found = [ros2_messages.decode(one, IMU_TYPE) for one in encode_messages(template, IMU_TYPE, stamps, values)]
+    assert [[one.header.stamp.sec, one.header.stamp.nanosec] for one in found] == stamps.tolist()
+    for kind, axes in (("angular_velocity", values[:, :3]), ("linear_acceleration", values[:, 3:])):
+        vectors = [getattr(one, kind) for one in found]
+        np.testing.assert_array_equal([[one.x, one.y, one.z] for one in vectors], axes)
+    assert [one.angular_velocity_covariance[0] for one in found] == [0.0, -1.0, 0.0]
+    assert [one.linear_acceleration_covariance[0] for one in found] == [0.0, 0.0, 0.0]
+    assert {one.header.frame_id for one in found} == {"imu"}
 
 
 def test_a_message_that_is_too_short() -> None:
