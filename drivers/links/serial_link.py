@@ -78,7 +78,7 @@ class Settings(LinkSettings):
     read_timeout: Annotated[float, READ_TIMEOUT_S] | None = Field(
         None,
         examples=[0.01],
-        description="longest time in s for which received bytes wait; absent: interval of `publish`, 4 to 100 ms",
+        description="time in s that received bytes may wait for more bytes; absent: interval of `publish`, 4 to 100 ms",
     )
     first_request: Annotated[str, checked_by(parse_request)] = Field(
         "", description="bytes in hexadecimal that are written once after the port has been opened; empty: none"
