@@ -146,6 +146,8 @@ class ZenohLink:
                 sample = handler.recv()
                 chunk = _to_chunk(sample, time.monotonic_ns())
                 with self._changed:
+                    if not self._running:
+                        return  # ``close`` dropped the queue, so a later message would follow a gap
                     self._enqueue(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from drivers.data_types import Chunk
-from drivers.errors import ConfigError, LinkUnavailable
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.links.base import Link
 from tests.support.ports import free_endpoint
@@ -69,6 +69,28 @@ def test_all_messages_are_received_in_order(router: Any, endpoint: str) -> None:
     wait_for(read, lambda: f"1000 messages, {len(got)} received")
     link.close()
     assert got == [i.to_bytes(4, "little") for i in range(1000)]
+
+
+def test_message_that_arrives_while_the_link_closes_is_not_received(router: Any, endpoint: str) -> None:
+    """Closing drops the queue, so the decoder would count the dropped messages before a later message as lost."""
+    link = build(key="k", connect=[endpoint])
+    assert isinstance(link, zenoh_link.ZenohLink)
+    link.open()
+    put_until_received(link, lambda: router.put("k", b"ready"))
+    session: Any = link._session
+
+    class LateSession:
+        def close(self) -> None:
+            router.put("k", b"late", congestion_control=zenoh.CongestionControl.BLOCK)
+            wait_for(lambda: link._waiting or not receiver.is_alive(), "the end of the receiver or a message")
+            session.close()
+
+    receiver = link._receiver
+    assert receiver is not None
+    link._session = LateSession()  # type: ignore[assignment]
+    link.close()
+    with pytest.raises(LinkLost):
+        link.wait_for_chunks_or_timeout(0.1)
 
 
 def test_peer_connects_to_a_router_that_starts_later(endpoint: str) -> None:
