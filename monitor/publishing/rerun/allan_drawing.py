@@ -62,6 +62,7 @@ DOT_RADIUS: Final = 2.5
 MARKER_CORNERS: Final = {"y": 4, "z": 3}
 """Number of corners of each axis's marker. The marker of an x axis is a dot."""
 POOR_FIT_TEXT: Final = "fit does not describe the curve"
+DISCONNECTED_TEXT: Final = "no connection: last result"
 
 Log = Callable[..., Any]
 """Function that logs components under the path of a Rerun entity."""
@@ -85,6 +86,7 @@ class AllanPlotPair:
         self._path = path
         self._drawn: dict[Kind, tuple[ChartDecadeRange, list[str], list[str]]] = {}  # grid, signs, poorly fitted axes
         self._units = units
+        self._disconnected: set[Kind] = set()  # plots that show DISCONNECTED_TEXT
 
     def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
         """Draw the Allan deviations of an estimate.
@@ -126,6 +128,14 @@ class AllanPlotPair:
                 ),
             )
             self._log(f"{self._path}/{kind}/letters", letters)
+
+    def show_connection(self, connected: bool) -> None:
+        """Write into each drawn plot that it is not updated while the device is not connected."""
+        for kind in self._drawn:
+            if connected == (kind in self._disconnected):
+                self._disconnected ^= {kind}
+                text = [] if connected else [(WIDTH / 2, 1.5, DISCONNECTED_TEXT)]
+                self._log(f"{self._path}/{kind}/disconnected", label_points(text))
 
     def _draw_grid(self, kind: Kind, scale: ChartDecadeRange, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"

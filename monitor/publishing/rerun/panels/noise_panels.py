@@ -67,6 +67,11 @@ class AllanAndCoefficientPanel(Panel):
         if self._history.add_estimate_and_check_column_complete(at_s, estimate):
             allan_history_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
 
+    def show_connection(self, unix_s: float, connected: bool) -> None:
+        """Show in the Allan plots whether the device is connected at a Unix time [s]."""
+        self.scene.set_log_time(unix_s)
+        self._plot.show_connection(connected)
+
 
 class CoefficientsPanel(Panel):
     """Noise coefficients with 95 % intervals over time."""

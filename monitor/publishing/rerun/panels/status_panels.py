@@ -13,7 +13,7 @@ from drivers.data_types import Event, Floats
 from monitor.common.device_health import Health
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
 from monitor.history.bucketed_history import HistoryTable
-from monitor.publishing.rerun.panels.noise_panels import CoefficientsPanel
+from monitor.publishing.rerun.panels.noise_panels import AllanAndCoefficientPanel, CoefficientsPanel
 from monitor.publishing.rerun.panels.panel import Panel
 from monitor.publishing.rerun.panels.panel_text import escape_markdown, events_text, health_text, overview_text
 from monitor.publishing.rerun.shared_views import markdown_document
@@ -38,6 +38,9 @@ class HealthPanel(Panel):
             return
         self.scene.entities.discard(f"/{self.entity_path('waiting')}")
         self._log_text("status", at_s, text)
+        if self.device in devices:
+            plots = self.scene.get_or_create_panel(self.device, AllanAndCoefficientPanel)
+            plots.show_connection(at_s, connected=health.state != "lost")
         self.scene.repeat_unchanged_entities(self.device, at_s)
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.get_or_create_panel("", AllDevicesTablePanel).log_table_of_all_devices(

@@ -12,6 +12,7 @@ from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import READING_TAU_S
 from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, LABEL_ABOVE, WIDTH
 from monitor.publishing.rerun.allan_drawing import (
+    DISCONNECTED_TEXT,
     DOT_RADIUS,
     FIT_WIDTH,
     KEY,
@@ -65,6 +66,20 @@ def test_fit_that_does_not_describe_the_curve_is_grey_and_named() -> None:
     assert len(select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS["gx"], FIT_WIDTH)) == 1
     assert not select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS["gz"], FIT_WIDTH)
     assert not select_lines(shown["d/accel/curves"], axis_colours.GREY, FIT_WIDTH)
+
+
+def test_plots_of_a_disconnected_device_say_so() -> None:
+    logged: list[tuple[str, Any]] = []
+    plots = AllanPlotPair(lambda path, *parts: logged.append((path, parts[0])), "d")
+    plots.show_connection(connected=False)  # nothing is drawn yet
+    assert not logged
+    plots.draw(make_estimate(), None)
+    logged.clear()
+    for connected in (True, False, False, True, True):
+        plots.show_connection(connected)
+    assert [(path, list_labels(points)) for path, points in logged] == [
+        (f"d/{kind}/disconnected", text) for text in ([DISCONNECTED_TEXT], []) for kind in ("gyro", "accel")
+    ]
 
 
 def test_each_axis_has_its_own_marker() -> None:

@@ -1,5 +1,6 @@
 """Tests of the entities that the viewer receives."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -62,6 +63,17 @@ def test_newest_messages_contain_every_entity(devices: list[str], monkeypatch: p
     assert paths - {path for path, _ in stream.calls[newest_messages:]} == set()
     first_s = DURATION_S - viewer_scene.REPEAT_PERIOD_S - 1.0
     assert min(unix_s for _, unix_s in stream.calls[newest_messages:]) >= T0 + first_s
+
+
+@pytest.mark.parametrize(("state", "noted"), [("running", False), ("ended", False), ("lost", True)])
+def test_plots_of_a_lost_device_are_marked(state: str, noted: bool) -> None:
+    stream = LoggingCalls()
+    scene = viewer_scene.AllDevicesScene(stream)  # type: ignore[arg-type]
+    scene.set_detailed_devices([ViewerDeviceDescription("left")])
+    scene.draw("left", "AllanAndCoefficientPanel", [(T0, example_results.make_estimate(T0))])
+    scene.draw("left", "HealthPanel", [(T0 + 5.0, replace(example_results.make_health(), state=state))])
+    marked = {(f"left/allan/{kind}/disconnected", T0 + 5.0) for kind in ("gyro", "accel")}
+    assert marked & set(stream.calls) == (marked if noted else set())
 
 
 def test_repeated_entity_does_not_replace_a_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
