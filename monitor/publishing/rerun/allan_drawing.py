@@ -62,7 +62,7 @@ DOT_RADIUS: Final = 2.5
 MARKER_CORNERS: Final = {"y": 4, "z": 3}
 """Number of corners of each axis's marker. The marker of an x axis is a dot."""
 POOR_FIT_TEXT: Final = "fit does not describe the curve"
-DISCONNECTED_TEXT: Final = "no connection: last result"
+DISCONNECTED_TEXT: Final = "no connection"
 
 Log = Callable[..., Any]
 """Function that logs components under the path of a Rerun entity."""
