@@ -7,6 +7,7 @@ samples, Allan plots and coefficients over time. Samples and Allan deviations ar
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 from drivers.errors import DecodeError
@@ -14,7 +15,7 @@ from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_device_states import RemoteDeviceRegistry, split_device_and_topic
+from monitor.publishing.remote_device_states import RemoteDevice, RemoteDeviceRegistry, split_device_and_topic
 from monitor.publishing.rerun.panels.panel_text import fleet_text
 from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.result_kinds import AllDevicesTableText, SampleBatch
@@ -132,6 +133,17 @@ class FleetView:
         self._viewer.put(
             "", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note, self._viewer.units))
         )
+        for one in devices:
+            if one.key in self._detail and one.state(now_s) in ("gone", "silent"):
+                self._draw_silence(one, now_s - one.last_message_s)
+
+    def _draw_silence(self, device: RemoteDevice, silence_s: float) -> None:
+        """Draw the state of a detailed device whose daemon sends nothing, because no status message contains it."""
+        status = device.status
+        if status is not None and status.t is not None:
+            text = f"no data from the daemon for {silence_s:.0f} s"
+            health = replace(status.to_health(), state="lost", rate_hz=None, text=text)
+            self._viewer.put(device.key, status.t + silence_s, health)
 
     def _show(self, device: str, topic: topics.ZenohTopic, payload: bytes) -> None:
         if topic is topics.SAMPLES:

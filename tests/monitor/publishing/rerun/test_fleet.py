@@ -10,6 +10,7 @@ import pytest
 from drivers.data_types import Event, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
+from monitor.common.device_health import Health
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry
 from monitor.publishing.rerun.fleet import FleetView, full_device_key
@@ -134,6 +135,26 @@ def test_status_without_a_time_is_in_the_table_but_not_drawn(monkeypatch: pytest
     )
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
+
+
+def test_page_of_a_device_whose_daemon_sends_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = RerunView(ViewerSettings(mode="none"), [ViewerDeviceDescription("imu/a")], fleet=True)
+    drawn: list[tuple[float, Health]] = []
+    monkeypatch.setattr(
+        viewer, "put", lambda _device, unix_s, one: drawn.append((unix_s, one)) if isinstance(one, Health) else None
+    )
+    fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
+    for name in "ab":
+        status = StatusMessage.from_result(name, 100.0, 0, example_results.make_health()).encode()
+        fleet.process_message(ReceivedMessageOrLiveliness(f"imu/{name}/status", status))
+    (heard_s,) = (one.last_message_s for one in fleet.board.devices_with_problems_first(0.0) if one.key == "imu/a")
+    drawn.clear()
+    fleet.draw_device_table(0.0, heard_s + 1.0)
+    assert not drawn
+    fleet.draw_device_table(0.0, heard_s + 7.0)
+    ((unix_s, health),) = drawn
+    assert unix_s == pytest.approx(107.0)
+    assert (health.state, health.rate_hz, health.text) == ("lost", None, "no data from the daemon for 7 s")
 
 
 def test_hostile_messages_are_counted_and_change_nothing() -> None:
