@@ -39,6 +39,7 @@ def test_recording_from_another_process_gives_the_published_allan_deviations(tmp
 name = "run1"
 rate = 100.0
 window = 10000.0
+publish = "100 Hz"  # the publisher waits until its samples are published
 restart = false  # the whole recording is compared
 driver = {{ link = "zenoh", key = "lab/run1", mode = "client", connect = ["{router}"], silence = 30.0 }}
 [zenoh]
