@@ -68,6 +68,7 @@ class FleetView:
         self._viewer = viewer
         self._detail = frozenset(detail)
         self.board = RemoteDeviceRegistry()
+        self._silent: set[str] = set()  # devices shown in detail whose daemon sends nothing
         self.malformed = 0  # number of messages of devices shown in detail that could not be decoded
 
     def run(self, stop: threading.Event, report: Callable[[str], None], duration_s: float | None = None) -> None:
@@ -133,16 +134,17 @@ class FleetView:
         self._viewer.put(
             "", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note, self._viewer.units))
         )
+        silent = {one.key for one in devices if one.key in self._detail and one.state(now_s) in ("gone", "silent")}
         for one in devices:
-            if one.key in self._detail and one.state(now_s) in ("gone", "silent"):
+            if one.key in silent - self._silent:
                 self._draw_silence(one, now_s - one.last_message_s)
+        self._silent = silent
 
     def _draw_silence(self, device: RemoteDevice, silence_s: float) -> None:
         """Draw the state of a detailed device whose daemon sends nothing, because no status message contains it."""
         status = device.status
         if status is not None and status.t is not None:
-            text = f"no data from the daemon for {silence_s:.0f} s"
-            health = replace(status.to_health(), state="lost", rate_hz=None, text=text)
+            health = replace(status.to_health(), state="lost", rate_hz=None, text="the daemon sends no data")
             self._viewer.put(device.key, status.t + silence_s, health)
 
     def _show(self, device: str, topic: topics.ZenohTopic, payload: bytes) -> None:

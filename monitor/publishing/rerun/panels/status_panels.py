@@ -40,7 +40,7 @@ class HealthPanel(Panel):
         self._log_text("status", at_s, text)
         if self.device in devices:
             plots = self.scene.get_or_create_panel(self.device, AllanAndCoefficientPanel)
-            plots.show_connection(at_s, connected=health.state != "lost")
+            plots.show_connection(at_s, connected=health.state not in ("lost", "waiting"))
         self.scene.repeat_unchanged_entities(self.device, at_s)
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.get_or_create_panel("", AllDevicesTablePanel).log_table_of_all_devices(

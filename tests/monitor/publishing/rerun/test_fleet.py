@@ -154,7 +154,9 @@ def test_page_of_a_device_whose_daemon_sends_nothing_says_so(monkeypatch: pytest
     fleet.draw_device_table(0.0, heard_s + 7.0)
     ((unix_s, health),) = drawn
     assert unix_s == pytest.approx(107.0)
-    assert (health.state, health.rate_hz, health.text) == ("lost", None, "no data from the daemon for 7 s")
+    assert (health.state, health.rate_hz, health.text) == ("lost", None, "the daemon sends no data")
+    fleet.draw_device_table(0.0, heard_s + 8.0)
+    assert len(drawn) == 1
 
 
 def test_hostile_messages_are_counted_and_change_nothing() -> None:

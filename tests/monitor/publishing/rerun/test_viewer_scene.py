@@ -65,8 +65,8 @@ def test_newest_messages_contain_every_entity(devices: list[str], monkeypatch: p
     assert min(unix_s for _, unix_s in stream.calls[newest_messages:]) >= T0 + first_s
 
 
-@pytest.mark.parametrize(("state", "noted"), [("running", False), ("ended", False), ("lost", True)])
-def test_plots_of_a_lost_device_are_marked(state: str, noted: bool) -> None:
+@pytest.mark.parametrize(("state", "noted"), [("running", False), ("ended", False), ("lost", True), ("waiting", True)])
+def test_plots_of_a_disconnected_device_are_marked(state: str, noted: bool) -> None:
     stream = LoggingCalls()
     scene = viewer_scene.AllDevicesScene(stream)  # type: ignore[arg-type]
     scene.set_detailed_devices([ViewerDeviceDescription("left")])
