@@ -102,10 +102,14 @@ class RemoteDevice:
             return "silent"
         return "present" if self.status is None else self.status.state
 
+    def sends_nothing(self, now_s: float) -> bool:
+        """Return True if no messages of the device arrive, although its recording has not ended."""
+        return self.state(now_s) in ("gone", "silent")
+
     def problems_first_rank(self, now_s: float) -> int:
         """Return the rank for sorting device tables: 0 without data, 1 with a problem, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
-        if state in ("lost", "gone", "silent"):
+        if state == "lost" or self.sends_nothing(now_s):
             return 0
         if state == "ended":
             return 3

@@ -134,7 +134,7 @@ class FleetView:
         self._viewer.put(
             "", wall_s, AllDevicesTableText(fleet_text(devices, now_s, MAX_ROWS, note, self._viewer.units))
         )
-        silent = {one.key for one in devices if one.key in self._detail and one.state(now_s) in ("gone", "silent")}
+        silent = {one.key for one in devices if one.key in self._detail and one.sends_nothing(now_s)}
         for one in devices:
             if one.key in silent - self._silent:
                 self._draw_silence(one, now_s - one.last_message_s)

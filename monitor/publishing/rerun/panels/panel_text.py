@@ -156,7 +156,7 @@ def _fleet_problem(one: RemoteDevice, now_s: float) -> str:
     """Return the problems of one device, or "" if there are none."""
     if one.status is None:
         return "no data yet"
-    silent = f"no data for {now_s - one.last_message_s:.0f} s" if one.state(now_s) in ("gone", "silent") else ""
+    silent = f"no data for {now_s - one.last_message_s:.0f} s" if one.sends_nothing(now_s) else ""
     return escape_markdown(one.describe_device_problems()) or silent
 
 
