@@ -6,7 +6,6 @@ A separate thread writes to the terminal, so that a blocked terminal or pipe can
 import contextlib
 import errno
 import gc
-import io
 import os
 import signal
 import sys
@@ -271,8 +270,11 @@ def _warn(text: str) -> None:
     structlog.get_logger("imu-monitor").warning("log", text=text)
 
 
-class _StderrIgnoringWriteErrors(io.TextIOBase):
-    """Text stream that writes to the current standard error and ignores write errors."""
+class _StderrIgnoringWriteErrors:
+    """Text stream that writes to the current standard error and ignores write errors.
+
+    A subclass of ``io.IOBase`` would be flushed when the interpreter ends, after this module has been cleared.
+    """
 
     def write(self, text: str) -> int:
         """Write text to standard error. Write errors, such as a full disk, are ignored."""

@@ -6,7 +6,7 @@ NaN. Unknown keys are ignored, so that messages from newer daemons remain readab
 """
 
 from functools import cache
-from typing import Annotated, Any, ClassVar, Final, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Self, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -130,7 +130,7 @@ def _encode_array(value: Any) -> Any:
 
 
 def _decode_array(kind: Any, value: Any) -> Any:
-    if kind == Ints:
+    if get_args(kind)[-1] == np.dtype[np.int64]:  # the other arguments depend on the version of NumPy
         try:
             return np.array(msgspec.convert(value, list[int]), np.int64)
         except OverflowError as error:

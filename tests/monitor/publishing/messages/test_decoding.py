@@ -2,13 +2,14 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.data_types import AXES, Event
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.messages.message import decode_message
+from monitor.publishing.messages.message import Message, decode_message
 from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,
@@ -37,6 +38,18 @@ def test_decoded_estimate_equals_the_original() -> None:
         ), name
     assert (got.rate_hz, got.window_s, got.samples) == (sent.rate_hz, sent.window_s, sent.samples)
     assert got.fitted == pytest.approx(sent.fitted, rel=0.02)
+
+
+class MessageWithNameOfShape(Message, frozen=True, kw_only=True, tag="counts"):
+    counts: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    levels: np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+
+
+def test_integers_stay_integers_whatever_the_version_of_numpy_calls_the_shape_of_arrays() -> None:
+    payload = b'{"schema":"counts","device":"","t":null,"samples":0,"counts":[1,2],"levels":[1.0,null]}'
+    found = decode_message(MessageWithNameOfShape, payload)
+    assert found.counts.dtype == np.int64
+    assert found.encode() == payload
 
 
 def test_poorly_fitted_axes_are_kept_and_absent_in_older_messages() -> None:
