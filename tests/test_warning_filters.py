@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 OF_OTHERS = {
     "deprecation_inside_a_package": "package.warn(DeprecationWarning)",

@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Final, Self, TypeVar, get_args
 import msgspec
 import numpy as np
 
-from drivers.data_types import Ints
 from monitor.common.topics import ZenohTopic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000
