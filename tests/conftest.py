@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -74,8 +74,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     items.sort(key=lambda item: not item.name.startswith(SLOWEST_TESTS))
     for item in items:
-        if LONG_FOLDERS & {folder.name for folder in item.path.relative_to(item.config.rootpath).parents}:
+        if not LONG_FOLDERS.isdisjoint(item.nodeid.partition("::")[0].split("/")):
             item.add_marker("long")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Skip the folders of the long tests if no long test is selected, because every worker would import them."""
+    return True if collection_path.name in LONG_FOLDERS and "not long" in config.option.markexpr else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+    """Search for doctests, which takes long, only in files that contain an example."""
+    found = yield
+    if not found or ">>>" in file_path.read_text("utf-8"):
+        return found
+    return [one for one in found if type(one) is pytest.Module]
 
 
 def pytest_unconfigure() -> None:

@@ -1,18 +1,16 @@
 """Tests of noise models: TOML files, errors in one line, seeds and sums."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import config
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, ConstantBias, GSensitivity, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
 
-MODELS = sorted(Path(p) for root in config.__path__ for p in Path(root).glob("models/*.toml"))
+MODELS = sorted((CONFIG_FOLDER / "models").glob("*.toml"))
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda p: p.stem)
