@@ -21,8 +21,8 @@ from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
 from tests.support.waiting import PATIENCE_S
 
-WORKERS_PER_CORE: Final = 3
-"""Many tests wait, so three workers for each core keep the processors busy."""
+WORKERS_PER_CORE: Final = 2
+"""Some tests wait, so two workers for each core keep the processors busy. Each worker collects all tests."""
 MAX_WORKERS: Final = 12
 LONG_FOLDERS: Final = {"benchmarks", "blind", "fuzz", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""

@@ -249,9 +249,9 @@ signals = {{ gx = "AngularRateInformation.RollRate" }}
 """
 
 
-@pytest.mark.parametrize("name", ["check", "run"])
 @pytest.mark.parametrize(
-    ("absent", "packages"), [(("can", "cantools"), "python-can and cantools"), (("can",), "python-can")]
+    ("name", "absent", "packages"),
+    [("check", ("can", "cantools"), "python-can and cantools"), ("run", ("can",), "python-can")],
 )
 @pytest.mark.parametrize(
     ("link", "source"),

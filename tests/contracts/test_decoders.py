@@ -26,7 +26,7 @@ from tests.contracts.decoder_examples import DECODER_NAMES, EXAMPLES, Example
 
 SAMPLE_COUNT = 16
 STEP_NS = 10_000_000
-FEW_EXAMPLES = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW_EXAMPLES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 STREAM_EXAMPLES = [example for example in EXAMPLES if example.carrier == "bytes"]
 CHECKED_EXAMPLES = [example for example in STREAM_EXAMPLES if example.checksum]
 PACKET_EXAMPLES = [example for example in EXAMPLES if example.carrier in ("frames", "messages")]

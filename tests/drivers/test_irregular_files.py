@@ -92,7 +92,7 @@ def test_file_descriptor_is_not_inherited(tmp_path: Path) -> None:
 
 
 def test_name_with_a_nul_character_raises_os_error() -> None:
-    with pytest.raises(OSError, match="null byte"):
+    with pytest.raises(OSError, match="embedded null"):
         safe_file_reading.open_regular_file(Path("a\0b"))
 
 

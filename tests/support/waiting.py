@@ -26,7 +26,7 @@ def wait_for(
     Parameters
     ----------
     condition
-        Called every 10 ms until its result is true.
+        Called until its result is true, with pauses of at least 10 ms and at least three times as long as the call.
     what
         Describes the condition in the error message. A callable is evaluated when the deadline has passed.
     patience_s
@@ -38,11 +38,14 @@ def wait_for(
         If the condition is still false after ``patience_s``.
     """
     deadline_s = time.monotonic() + patience_s
-    while not (found := condition()):
-        if time.monotonic() > deadline_s:
+    while True:
+        called_s = time.monotonic()
+        if found := condition():
+            return found
+        now_s = time.monotonic()
+        if now_s > deadline_s:
             raise AssertionError(f"waited {patience_s:g} s for {what() if callable(what) else what}")
-        time.sleep(POLL_S)
-    return found
+        time.sleep(max(POLL_S, 3.0 * (now_s - called_s)))  # leaves the processor to the program that is waited for
 
 
 def stays_true(condition: Callable[[], object], seconds: float = 0.5) -> bool:

@@ -117,7 +117,7 @@ readers = st.builds(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(reader=readers, kind=COUNTERS)
 def test_every_sample_counts_as_received_or_lost(reader: Reader, kind: tuple[CounterTimedFormat, bool]) -> None:
     counter, configured = kind
@@ -135,10 +135,9 @@ def test_every_sample_counts_as_received_or_lost(reader: Reader, kind: tuple[Cou
 PAUSES = [Pause(12.0, 0.4), Pause(15.0, 8.0), Pause(30.0, 1.5)]
 
 
-@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize(("configured", "with_pauses"), [(True, True), (False, False)])
 @pytest.mark.parametrize("counter", [TIME_COUNTER, SAMPLE_COUNTER])
-@pytest.mark.parametrize("ahead_s", [-3600.0, -45.0, 30.0, 3600.0, 86400.0])
-@pytest.mark.parametrize("with_pauses", [False, True])
+@pytest.mark.parametrize("ahead_s", [-3600.0, -45.0, 30.0, 86400.0])
 def test_counter_jump_is_reported_and_counts_as_no_loss(
     counter: CounterTimedFormat, configured: bool, ahead_s: float, with_pauses: bool
 ) -> None:
@@ -156,7 +155,7 @@ def test_counter_jump_is_reported_and_counts_as_no_loss(
     assert len(get_jump_events(clock)) == 1
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     start_s=st.floats(SETTLED_S + 1.0, 50.0),
     duration_s=st.floats(0.0, 20.0),

@@ -72,7 +72,6 @@ XSENS = (1 << 32, 1e-4)
 VECTORNAV = (1 << 62, 1e-9)
 COUNTERS = [
     (STIM300, 125.0),
-    (STIM300, 262.0),
     (SAMPLES_16, 100.0),
     ((256, None), 100.0),
     (XSENS, 100.0),
@@ -90,8 +89,15 @@ def compute_ticks(index, kind, rate):
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
 class TestCounter:
     @pytest.mark.long
-    @pytest.mark.parametrize("gaps", [[], [(5, 3)], [(300, 1), (400, 10), (402, 1)], [(900, 300)]])
-    @pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
+    @pytest.mark.parametrize(
+        ("gaps", "delay"),
+        [
+            ([], delay_randomly),
+            ([(5, 3)], delay_to_next_poll),
+            ([(300, 1), (400, 10), (402, 1)], delay_randomly),
+            ([(900, 300)], delay_to_next_poll),
+        ],
+    )
     def test_missing_samples_are_counted_exactly(self, kind, rate, configured, gaps, delay):
         index = np.arange(int(24 * rate))
         kept = np.ones(index.size, bool)
@@ -250,7 +256,7 @@ def test_clock_adapts_to_a_new_rate_of_the_device():
 # --- arrival times alone
 
 
-@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0, 2000.0])
+@pytest.mark.parametrize("rate", [20.0, 99.32, 2000.0])
 @pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
 @pytest.mark.parametrize("configured", [True, False])
 def test_sample_times_do_not_contain_the_arrival_jitter(rate, delay, configured):
@@ -271,7 +277,7 @@ def test_sample_times_do_not_contain_the_arrival_jitter(rate, delay, configured)
     assert clock.measured_hz == pytest.approx(rate, rel=2e-4)
 
 
-@pytest.mark.parametrize("rate", [20.0, 99.32, 100.0])
+@pytest.mark.parametrize("rate", [20.0, 99.32])
 @pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
 @pytest.mark.parametrize("configured", [True, False])
 class TestArrival:

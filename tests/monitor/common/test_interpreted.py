@@ -70,7 +70,7 @@ def draw_random_signal(rng: np.random.Generator, n: int, kind: int) -> Floats:
 def process_random_samples(seed: int) -> list[Any]:
     """Process a random stream of samples and return all results as arrays and lists."""
     rng = np.random.default_rng(seed)
-    n = int(rng.integers(200, 700))
+    n = int(rng.integers(150, 400))
     values = draw_random_signal(rng, n, seed % SIGNAL_KINDS)
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
     monitor, compensation = (

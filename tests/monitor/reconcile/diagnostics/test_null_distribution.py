@@ -139,7 +139,7 @@ def test_non_gaussian_effects_need_all_simulations():
     assert not is_stationary_gaussian((AngleRandomWalk(N=1e-4), Saturation(limit=1.0)))
 
 
-@pytest.mark.parametrize("n", [6000, 140_000])
+@pytest.mark.parametrize("n", [6000, pytest.param(140_000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("model", [(WHITE,), (WHITE, WALK), (WHITE, RateRandomWalk(K=1e-3))], ids=["N", "NK", "K"])
 def test_gains_of_true_models_follow_the_expected_distribution(model, n):
     """Of 40 recordings, 1 to 22 exceed the upper quartile, except with a probability of 2e-5 for each diagnostic."""
