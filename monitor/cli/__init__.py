@@ -5,6 +5,7 @@ status 3 means that the data do not support an answer.
 """
 
 import contextlib
+import logging
 import os
 import re
 import sys
@@ -125,10 +126,13 @@ app.add_typer(_thermal, name="thermal")
 def main() -> None:
     """Run the program with the arguments of the process, and exit with the status of the command.
 
-    Every error is printed as one line on standard error. The option ``--debug`` adds the traceback, and may precede or
-    follow the name of the command.
+    Every error is printed as one line on standard error. The option ``--debug`` adds the traceback and debug messages,
+    and may precede or follow the name of the command.
     """
     arguments, debug = _split_debug(sys.argv[1:])
+    if debug:
+        logging.basicConfig(format="imu-monitor: %(message)s")
+        logging.getLogger("monitor").setLevel(logging.DEBUG)
     threading.excepthook = partial(report_failed_thread, debug)
     _ignore_impossible_width(os.environ)
     try:

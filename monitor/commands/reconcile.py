@@ -5,6 +5,7 @@ The report consists of ``report.html``, ``report.json``, ``model.toml`` and, if 
 recordings are compared, the report of each recording is written to a subfolder.
 """
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -115,6 +116,8 @@ def reconcile_recording(
     recording, grid_notes = _to_regular_grid(found)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         result = reconcile(recording, model, seed, pool.map, report_progress)
+    for failure in result.failed_candidates:
+        logging.getLogger(__name__).debug("candidate effect dropped: %s", failure)
     return replace(result, notes=(*notes, *found.notes, *grid_notes, *result.notes))
 
 

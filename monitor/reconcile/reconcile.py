@@ -147,7 +147,10 @@ def reconcile(
     found = replace(found, searches=name_common_vibrations(found.searches, null))
     report_stage("looking for a simpler explanation", None)
     simpler = eliminate_unneeded_effects(found.searches, null, model is None, map_function)
-    found = replace(found, searches=add_sample_rate_as_alternative(simpler))
+    found = replace(found, searches=simpler)
+    found = next(iter(simpler.values())).hypothesis.axis.evaluate_candidate(
+        SampleRateError.name, lambda: replace(found, searches=add_sample_rate_as_alternative(simpler)), found
+    )
     extended = _add_found_effects(tested, found)
     final = null
     if found.searches_that_changed_model or found.sample_rate_error:
@@ -176,6 +179,11 @@ def reconcile(
         seed=seed,
         notes=notes,
         recording_findings=checked.findings,
+        failed_candidates=tuple(
+            f"{name}: {candidate}: {reason}"
+            for name, one in found.searches.items()
+            for candidate, reason in one.hypothesis.axis.failures.items()
+        ),
     )
 
 
@@ -282,12 +290,16 @@ def _search_all_axes(
     effects = _effects_by_axis(model, run.recording)
     axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
     axes = {name: replace(axis, is_model_fitted=fitted_first) for name, axis in axes.items()}
-    error = estimate_sample_rate_error(
-        {name: axis.coefficients for name, axis in axes.items()},
-        run.recording.rate_hz,
-        effects,
-        model.sample_rate_hz,
-        detect_sample_rate_error(axes, effects),
+    error = next(iter(axes.values())).evaluate_candidate(
+        SampleRateError.name,
+        lambda: estimate_sample_rate_error(
+            {name: axis.coefficients for name, axis in axes.items()},
+            run.recording.rate_hz,
+            effects,
+            model.sample_rate_hz,
+            detect_sample_rate_error(axes, effects),
+        ),
+        None,
     )
     if error is not None:
         ratio = float(error.ratio.value)

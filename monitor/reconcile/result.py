@@ -1,8 +1,10 @@
 """Result types of ``reconcile``, in SI units. Times are in seconds from the start of the recording."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
+
+import numpy as np
 
 from drivers.data_types import Floats
 from monitor.noise.effect import Effect
@@ -114,12 +116,31 @@ class AxisModelDiagnostics:
     plots: tuple[DiagnosticPlotData, ...]  # one for each diagnostic that has a plot
 
 
+def comparable_allan_deviations(
+    start: AxisModelDiagnostics, end: AxisModelDiagnostics
+) -> tuple[DiagnosticPlotData, DiagnosticPlotData]:
+    """Return the Allan deviations of the model under test and of the extended model.
+
+    If the search replaced samples, such as outliers, their share of the measured Allan variance is added to the
+    extended model. The figures show these curves, and the stated ratios are ratios of these curves.
+
+    Parameters
+    ----------
+    start, end : AxisModelDiagnostics
+        Diagnostics with the model under test and with the extended model.
+    """
+    before, after = (next(view for view in one.plots if view.diagnostic == "allan") for one in (start, end))
+    replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
+    curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
+    return before, replace(after, **curves)
+
+
 @dataclass(frozen=True, slots=True)
 class AllanInfluence:
-    """Largest influence of an effect on the Allan deviation of an axis."""
+    """Change of the Allan deviation of an axis at the averaging time that an effect influences most."""
 
-    ratio: float  # Allan deviation with the effect relative to the Allan deviation without the effect
-    tau_s: float  # averaging time with the largest influence
+    ratio: float  # Allan deviation of the extended model relative to the model under test, all changes included
+    tau_s: float  # averaging time with the largest influence of the effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +200,7 @@ class Reconciliation:
     seed: int
     notes: tuple[str, ...] = ()
     recording_findings: tuple[RecordingFinding, ...] = ()  # the most serious fault first
+    failed_candidates: tuple[str, ...] = ()  # candidate effects that were dropped because they failed numerically
 
 
 def combine_decisions(verdicts: Iterable[Decision]) -> Decision:

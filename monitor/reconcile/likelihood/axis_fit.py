@@ -7,8 +7,8 @@ so the regressors and the sums over frequency bins are cached.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from math import prod, sqrt
-from typing import Final, NamedTuple
+from math import inf, isfinite, prod, sqrt
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -79,6 +79,7 @@ INITIAL_FLOOR_RATIO: Final = 1e-3
 """Smallest starting value of the white noise added after a low-pass filter, relative to the total power."""
 Effects = tuple[Effect, ...]
 """Effects of one axis."""
+Evaluated = TypeVar("Evaluated")
 Regressor = tuple[Effect, int]
 """Deterministic effect and the index of one of its regressors."""
 
@@ -166,6 +167,7 @@ class Axis:
     is_model_fitted: bool = False  # True if the model under test was fitted to this recording
     is_temperature_coarse: bool = False  # True if the sizes of temperature effects are not compared with the model
     sources_of_unchanged_leaks: frozenset[str] = frozenset()  # sources of leaks of the model whose size is kept
+    failures: dict[str, str] = field(default_factory=dict)  # first numerical failure of each candidate effect, by name
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     cosine_transform_rms: float = field(init=False)  # root mean square of the coefficients, in the unit of the axis
     used_count: Floats = field(init=False)  # [m] number of coefficients, or 0 for bins that are not used
@@ -230,6 +232,21 @@ class Axis:
             self._bases[key] = np.mean(self.white_noise_gain_over_time(gains) ** 2, keepdims=True)
         return float(self._bases[key][0])
 
+    def evaluate_candidate(self, name: str, evaluate: Callable[[], Evaluated], rejected: Evaluated) -> Evaluated:
+        """Return the result of ``evaluate``, or ``rejected`` if the candidate effect fails numerically.
+
+        The first failure of each name is kept in ``failures``.
+        """
+        try:
+            return evaluate()
+        except (ArithmeticError, ValueError) as error:  # includes singular matrices and invalid parameters
+            self.failures.setdefault(name, str(error) or type(error).__name__)
+            return rejected
+
+    def candidate_log_likelihood(self, effects: Sequence[Effect], fixed_sizes: frozenset[int] = frozenset()) -> float:
+        """Return the log-likelihood of a fit whose last effect is a candidate, or −inf if the fit fails numerically."""
+        return self.evaluate_candidate(effects[-1].name, lambda: self.fit(effects, fixed_sizes).log_likelihood, -inf)
+
     def fit(
         self,
         effects: Sequence[Effect],
@@ -249,6 +266,11 @@ class Axis:
         -------
         AxisFit
             Fitted sizes and log-likelihood.
+
+        Raises
+        ------
+        FloatingPointError
+            If the log-likelihood is not finite.
         """
         transforms = _spectral_transforms(effects, self.value_artifacts)
         noise = self._noise_variances(effects, fixed_sizes, transforms)
@@ -270,6 +292,8 @@ class Axis:
             is_unsigned = any(isinstance(effect, UNSIGNED_SERIES) for effect, _, _ in known)
             free_beta = fit_sizes(sums).beta if is_unsigned else np.zeros(len(columns))
             fitted = _fit_with_fixed_regressors(fit_sizes, sums, _fixed_beta(known, free_beta))
+        if not isfinite(fitted.log_likelihood):
+            raise FloatingPointError("the log-likelihood is not finite")
         return AxisFit(
             self, tuple(effects), fixed_sizes, fitted.log_likelihood, fitted, tuple(noise.fitted), slices, gains
         )

@@ -6,7 +6,7 @@ added effects and of deterministic effects are always fitted.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from math import exp, log, sqrt
+from math import exp, inf, log, sqrt
 from typing import Final
 
 import numpy as np
@@ -305,7 +305,9 @@ def fit_shape_parameter(
     if parameter_name == "frequency":
         highest = min(highest, log(0.5 * axis.rate_hz))  # frequencies above half the sample rate are aliases
     best = find_maximum_by_golden_section(
-        lambda x: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood,
+        lambda x: axis.evaluate_candidate(
+            effect.name, lambda: axis.fit((*other_effects, with_shape_parameter(x))).log_likelihood, -inf
+        ),
         middle - width,
         highest,
         SHAPE_ITERATIONS,
@@ -428,10 +430,14 @@ def compute_shape_interval(fit: AxisFit, effect_index: int, parameter_name: str)
     value = float(getattr(effect, parameter_name))
     limit_nats = STEP_TIME_95_NATS if isinstance(effect, BiasStep) else HALF_CHI2_95
 
-    def is_likely(log_factor: float) -> bool:
+    def log_likelihood_of_shape(log_factor: float) -> float:
         shaped = with_shape(effect, parameter_name, value * exp(log_factor))
         changed = (*effects[:effect_index], shaped, *effects[effect_index + 1 :])
-        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_sizes).log_likelihood < limit_nats
+        return fit.axis.fit(changed, fit.fixed_sizes).log_likelihood
+
+    def is_likely(log_factor: float) -> bool:
+        shaped = fit.axis.evaluate_candidate(effect.name, lambda: log_likelihood_of_shape(log_factor), -inf)
+        return fit.log_likelihood - shaped < limit_nats
 
     ends = []
     for sign in (-1.0, 1.0):

@@ -103,8 +103,8 @@ class WhitenedAxis:
 
     @cached_property
     def outlier_fit(self) -> OutlierFit | None:
-        """Fit of outliers to the flattened series, or None if a Gaussian fits equally well."""
-        return fit_outliers(self.flat_series)
+        """Fit of outliers to the flattened series, or None if a Gaussian fits as well or the values are too coarse."""
+        return None if self.axis.value_artifacts.is_too_coarse_for_outliers else fit_outliers(self.flat_series)
 
 
 def whiten_axis(fit: AxisFit) -> WhitenedAxis:

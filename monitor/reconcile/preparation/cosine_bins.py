@@ -32,6 +32,8 @@ PEAK_REACH_HALF_WIDTHS: Final = 30.0
 MIN_COEFFICIENTS_PER_BIN: Final = 64
 """Smallest number of coefficients in a bin whose power is not smoothed. The standard error is 18 %.
 """
+MIN_POWER: Final = 1e-300
+"""Smallest mean square of a bin, so that a series without power can be divided by it."""
 SMOOTHING_BINS: Final = 9
 """Number of neighbouring bins over which the power of a small bin is averaged."""
 
@@ -58,11 +60,11 @@ class FrequencyBins:
     def smoothed_mean_square(self, coefficients: Floats) -> Floats:
         """Return the mean square of coefficients, shape (n − 1,), in each bin, shape (m,).
 
-        If a bin has few coefficients, the mean includes neighbouring bins.
+        If a bin has few coefficients, the mean includes neighbouring bins. The mean is never zero.
         """
         sums, window = self.sum_over_bins(coefficients**2), np.ones(SMOOTHING_BINS)
         smoothed = np.convolve(sums, window, "same") / np.convolve(self.count, window, "same")
-        return np.where(self.count >= MIN_COEFFICIENTS_PER_BIN, sums / self.count, smoothed)
+        return np.maximum(np.where(self.count >= MIN_COEFFICIENTS_PER_BIN, sums / self.count, smoothed), MIN_POWER)
 
     def expand_to_coefficients(self, bin_values: Floats) -> Floats:
         """Repeat the value of each bin, shape (m,), for all coefficients of the bin, shape (n − 1,)."""

@@ -5,7 +5,8 @@ without the artifact.
 
 A quantization step can be a hundredth of the noise. A step of the number format, such as float32 or decimal text, is
 reported only if the step is at least a tenth of the noise. Repeated samples cannot be detected if the step exceeds the
-noise. Clipping cannot be detected if the step exceeds two standard deviations.
+noise. Clipping cannot be detected if the step exceeds two standard deviations. Outliers are not tested if the step
+exceeds 1.25 standard deviations.
 """
 
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ MIN_NOISE_TO_STEP_CLIPPING: Final = 0.5
 MIN_NOISE_TO_STEP_REPEATS: Final = 0.9
 """Smallest ratio of noise to step at which repeats are tested.
 """
+MIN_NOISE_TO_STEP_OUTLIERS: Final = 0.8
+"""Smallest ratio of noise to step at which outliers are tested. Below 0.74, most samples can have the same value."""
 CHANCE_RELATIVE_ERROR: Final = 0.01
 """Relative uncertainty of the expected number of equal neighbours, because the noise is only nearly Gaussian."""
 MIN_EXPECTED_COINCIDENCES: Final = 1e-3
@@ -121,6 +124,13 @@ class ValueArtifacts:
         """Repeated samples, or None if no repeats are detected."""
         ends = self.clipping
         return detect_repeats(self._y, self._step, ends.limit.value if ends and ends.symmetric else np.inf)
+
+    @cached_property
+    def is_too_coarse_for_outliers(self) -> bool:
+        """True if the step is so large that all samples beside the most frequent value would appear as outliers."""
+        return self._step > 0.0 and _noise_despite_repeats(_finite_values(self._y)) < (
+            MIN_NOISE_TO_STEP_OUTLIERS * self._step
+        )
 
     @property
     def _step(self) -> float:
@@ -257,6 +267,11 @@ def _finite_values(y: Floats) -> Floats:
 
 def _sample_noise(values: Floats) -> float:
     return SIGMA_PER_MEAN_DISTANCE * float(np.abs(np.diff(values)).mean())
+
+
+def _noise_despite_repeats(values: Floats) -> float:
+    """Return the noise from differences over two samples, on which repeated samples have less influence."""
+    return SIGMA_PER_MEAN_DISTANCE * float(np.abs(values[2:] - values[:-2]).mean())
 
 
 def _float_spacing(values: Floats) -> float:

@@ -14,6 +14,7 @@ undone if a diagnostic becomes significant.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, Final
 
@@ -79,14 +80,17 @@ def eliminate_unneeded_effects(
 
     def simplify_named_axis(name: str) -> AxisSearchResult:
         others = [effect for other, effects in added.items() if other != name for effect in effects]
-        return _simplify_axis(found[name], others, null[name])
+        simplify = partial(_simplify_axis, found[name], others, null[name])
+        return found[name].hypothesis.axis.evaluate_candidate("simpler explanation", simplify, found[name])
 
     simpler = dict(zip(found, map_function(simplify_named_axis, found), strict=True))
     if fitted_first:
         return simpler
     for names in (*((name,) for name in simpler), *TRIADS):
         if set(names) <= set(simpler):
-            simpler |= _with_common_factor({name: simpler[name] for name in names}, null)
+            searches = {name: simpler[name] for name in names}
+            axis, replace_sizes = searches[names[0]].hypothesis.axis, partial(_with_common_factor, searches, null)
+            simpler |= axis.evaluate_candidate(ScaleFactor.name, replace_sizes, searches)
     return simpler
 
 

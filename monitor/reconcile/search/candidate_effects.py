@@ -290,7 +290,7 @@ def fit_low_pass(axis: Axis, other_effects: Effects) -> BandwidthLimit | None:
         assert isinstance(refined, BandwidthLimit)
         for one, penalty in ((refined, FLOOR_PENALTY_NATS), (replace(refined, floor=None), 0.0)):
             if one.cutoff < 0.99 * nyquist:
-                found[one] = axis.fit((*other_effects, one)).log_likelihood - penalty
+                found[one] = axis.candidate_log_likelihood((*other_effects, one)) - penalty
     return max(found, key=lambda one: found[one]) if found else None
 
 
@@ -356,7 +356,7 @@ def _best_time_constant(
     exponential is at least 2 √1.36/(1 + 1.36) = 0.988. The first search therefore finds nearly the largest gain.
     """
     best = _most_likely(whitened.axis, whitened.effects, trials)
-    gain = whitened.axis.fit((*whitened.effects, best)).log_likelihood
+    gain = whitened.axis.candidate_log_likelihood((*whitened.effects, best))
     if gain - whitened.axis.fit(whitened.effects).log_likelihood < MIN_REFINED_SHARE * PENALTY_NATS[best.name]:
         return []
     refined = fit_shape_parameter(whitened.axis, whitened.effects, best, "time_constant", search_factor)
@@ -397,7 +397,7 @@ DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
 
 
 def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effect:
-    return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
+    return max(trials, key=lambda one: axis.candidate_log_likelihood((*effects, one)))
 
 
 def initial_effect_size(axis: Axis) -> float:

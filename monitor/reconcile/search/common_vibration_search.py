@@ -144,8 +144,9 @@ def name_common_vibrations(
         Null distributions of each axis.
     """
     searches = dict(found)
-    for _ in range(MAX_SOURCES):
-        better = _with_strongest_vibration(searches, null) if len(searches) > 1 else {}
+    for _ in range(MAX_SOURCES if len(searches) > 1 else 0):
+        axis, none = next(iter(searches.values())).hypothesis.axis, dict[str, AxisSearchResult]()
+        better = axis.evaluate_candidate(CommonVibration.name, partial(_with_strongest_vibration, searches, null), none)
         if not better:
             break
         searches |= better
@@ -527,6 +528,7 @@ def _build_trial(joint: _JointFit, number: float, at: int) -> Trial:
 def _with_vibration(search: AxisSearchResult, kept: Effects, trial: Trial) -> AxisSearchResult:
     """Return the result of one axis with the vibration."""
     assert trial.effect is not None
+    trial.effect.check_rate(search.hypothesis.axis.rate_hz)
     hypothesis = fit_with_fewest_changes(search.hypothesis.axis, (*kept, trial.effect), search.hypothesis.model)
     done = SearchRound(search.final, (trial,), hypothesis, accept_without_validation(VALIDATION_REASON))
     rounds, final = (*search.rounds, done), diagnose_hypothesis(hypothesis)

@@ -12,6 +12,7 @@ coefficients of an axis. The last term shifts the most likely value of d if e is
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, log
 
 from monitor.noise.effect import AxisLeak
@@ -79,7 +80,11 @@ def _with_alternatives(
     rounds = list(search.rounds)
     for leak in _find_changed_leaks(search.hypothesis):
         other = first_found[leak.source].hypothesis if leak.source in first_found else None
-        opposite = None if other is None else _find_leak_from(name, other) or _fit_added_leak_from(name, other)
+        opposite = None if other is None else _find_leak_from(name, other)
+        if opposite is None and other is not None:
+            opposite = other.axis.evaluate_candidate(
+                CrossAxis.name, partial(_fit_added_leak_from, name, other), opposite
+            )
         at = next((at for at, one in enumerate(rounds) if _has_fitted_leak(one.hypothesis, leak.source)), None)
         if opposite is None or at is None:
             continue

@@ -19,7 +19,6 @@ from monitor.common.compiled import compiled
 from monitor.noise.effects import Outliers, RandomSampleHold, Saturation, WanderingLine
 from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.hypothesis_fit import fit_deterministic_effects
-from monitor.reconcile.likelihood.outlier_fit import fit_outliers
 from monitor.reconcile.likelihood.wandering_line_vs_resonance import draw_wandering_line
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import (
@@ -357,5 +356,5 @@ def _subtract_wandering_lines(axis: Axis, effects: Effects, rng: np.random.Gener
 def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
     if not any(isinstance(effect, Outliers) for effect in effects):
         return axis
-    found = fit_outliers(whiten_axis(fit_deterministic_effects(axis, effects)).flat_series)
+    found = whiten_axis(fit_deterministic_effects(axis, effects)).outlier_fit
     return axis if found is None else axis.with_repaired_samples(fill_missing_samples(axis.repaired, found.mask, rng))

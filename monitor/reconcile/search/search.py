@@ -6,6 +6,7 @@ that no longer contribute are dropped. After the last round, effects that the di
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -178,7 +179,7 @@ def _next_round(
     if better or conspicuous:
         current, completed = _try_groups(current, better, agrees, null, rng)
     if completed is None and agrees and later and _is_gaussian_and_stationary(whitened, null):
-        completed = _replace_slow_noise(current)
+        completed = hypothesis.axis.evaluate_candidate("jump process", partial(_replace_slow_noise, current), None)
     return current, completed
 
 
@@ -234,40 +235,57 @@ def _select_trial(
     current: _DiagnosedHypothesis, trials: list[Trial], null: AxisNull, rng: np.random.Generator
 ) -> _CompletedRound | None:
     """Return the round that adds the first trial effect that passes all tests, or None."""
-    findings = current.findings
-    strongest = max(findings, key=lambda name: findings[name].gain - null[name].threshold)
+    axis = current.hypothesis.axis
     for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
         if trial.score <= 0.0 or trial.is_rival_only:
             return None
-        diagnostic = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
-        after = _add_effect(current.hypothesis, trial, rng)
-        added = None if trial.effect is None or trial.moved is not None else after.added[-1]
-        if added is not None and _has_zero_size(added):
-            continue
-        whitened = whiten_axis(after.fit)
-        if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[diagnostic](whitened).gain >= findings[diagnostic].gain:
-            continue
-        tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
-        lines = compare_resonance_with_lines(after) if isinstance(added, Narrowband) else None
-        if lines is not None and (lines.is_modulated or (lines.is_sweep and lines.gain > MIN_LINE_GAIN_NATS)):
-            continue
-        if lines is not None:
-            line = wandering_line_trial(lines, trial)
-            tried = [trial, line, *tried[1:]]
-            if lines.gain > MIN_LINE_GAIN_NATS:
-                tried[:2] = line, trial
-                after, added = _add_effect(current.hypothesis, line, rng), lines.line
-                whitened = whiten_axis(after.fit)
-                if difference_remains_near_line(lines.line, findings, whitened, null):
-                    continue
-        if _is_gaussian_and_stationary(whitened, null):
-            after, tried = replace_by_likelier_alternative(after, tried)
-            whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
-        validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic])
-        if validation.kept:
-            done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
-            return done, _diagnose(after, whitened)
+        done = axis.evaluate_candidate(trial.name, partial(_accept_trial, current, trials, at, null, rng), None)
+        if done is not None:
+            return done
     return None
+
+
+def _accept_trial(
+    current: _DiagnosedHypothesis, trials: list[Trial], at: int, null: AxisNull, rng: np.random.Generator
+) -> _CompletedRound | None:
+    """Return the round that adds the effect of one trial, or None if the effect does not pass all tests."""
+    trial, findings = trials[at], current.findings
+    strongest = max(findings, key=lambda name: findings[name].gain - null[name].threshold)
+    diagnostic = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
+    after = _add_effect(current.hypothesis, trial, rng)
+    added = None if trial.effect is None or trial.moved is not None else after.added[-1]
+    if added is not None and _has_zero_size(added):
+        return None
+    whitened = whiten_axis(after.fit)
+    if trial.name in ONE_TIME_EFFECTS and DIAGNOSTICS[diagnostic](whitened).gain >= findings[diagnostic].gain:
+        return None
+    tried = [trial, *trials[:at], *trials[at + 1 :]]  # a rejected trial still reduces the confidence
+    lines = None
+    if isinstance(added, Narrowband):
+        compare = partial(compare_resonance_with_lines, after)
+        lines = after.axis.evaluate_candidate(WanderingLine.name, compare, None)
+    if lines is not None and (lines.is_modulated or (lines.is_sweep and lines.gain > MIN_LINE_GAIN_NATS)):
+        return None
+    if lines is not None:
+        line = wandering_line_trial(lines, trial)
+        tried = [trial, line, *tried[1:]]
+        if lines.gain > MIN_LINE_GAIN_NATS:
+            tried[:2] = line, trial
+            after, added = _add_effect(current.hypothesis, line, rng), lines.line
+            whitened = whiten_axis(after.fit)
+            if difference_remains_near_line(lines.line, findings, whitened, null):
+                return None
+    if _is_gaussian_and_stationary(whitened, null):
+        replace_effect = partial(replace_by_likelier_alternative, after, tried)
+        after, tried = after.axis.evaluate_candidate("non-Gaussian alternative", replace_effect, (after, tried))
+        whitened = whitened if after.fit is whitened.fit else whiten_axis(after.fit)
+    for effect in after.added:
+        effect.check_rate(after.axis.rate_hz)
+    validation = cross_validate(current.hypothesis, after, added, diagnostic, null[diagnostic])
+    if not validation.kept:
+        return None
+    done = SearchRound(current.findings_and_plots(), tuple(tried), after, validation)
+    return done, _diagnose(after, whitened)
 
 
 def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) -> Hypothesis:

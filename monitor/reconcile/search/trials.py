@@ -13,7 +13,9 @@ If a noise effect is much better, group 4 comes before group 3.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from functools import partial
+from math import isnan
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy.special import chdtrc
@@ -41,7 +43,7 @@ from monitor.noise.effects import (
 from monitor.noise.effects.disturbances.heavy_tails import DEGREES_OF_FREEDOM
 from monitor.reconcile.diagnostics.whiteness_tests import STEP_MARGIN_FRACTION, find_changed_resolution
 from monitor.reconcile.effect_properties import PENALTY_NATS
-from monitor.reconcile.likelihood.axis_fit import Effects
+from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coefficient_names
 from monitor.reconcile.likelihood.hypothesis_fit import (
     RESIZE_PENALTY_NATS,
@@ -116,6 +118,8 @@ MAX_MOVED_SIZE_RATIO: Final = 3.0
 NOISE_PRIORITY_NATS: Final = 5.0
 """Smallest score advantage, in nats, at which noise effects are tried before deterministic effects."""
 
+Proposed = TypeVar("Proposed", Effect, "Trial")
+
 
 @dataclass(frozen=True, slots=True)
 class Trial:
@@ -136,6 +140,10 @@ class Trial:
     moved: int | None = None  # index of the model effect that ``effect`` replaces; None for an additional effect
     replaced: Effect | None = None  # this model effect
 
+    def __post_init__(self) -> None:
+        if isnan(self.score):
+            raise FloatingPointError("the score is not a number")
+
     @property
     def score_with_slow_noise(self) -> float:
         """Score relative to the hypothesis before the round, in nats. Scores of the same round are comparable."""
@@ -152,12 +160,10 @@ def generate_trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Ite
     whitened : WhitenedAxis
         Axis whitened with ``hypothesis``.
     """
-    yield _value_trials(whitened)
-    samples = _outlier_trial(hypothesis, whitened) + _heavy_tails_trial(whitened)
-    samples += _noise_step_trial(whitened) + _variance_modulation_trial(whitened) + _wandering_variance_trial(whitened)
-    samples = _best_first(samples)
+    yield _best_first(_call_for_axis(VALUE_TRIALS, whitened))
+    samples = _best_first(_call_for_axis(SAMPLE_TRIALS, whitened))
     # short pulses have heavy tails and a periodic variance too, and are tried with the noise effects
-    pulses = [_noise_trial(hypothesis, effect) for effect in propose_pulse_trains(whitened)] if samples else []
+    pulses = _noise_trial_of_each(hypothesis, _call_for_axis((propose_pulse_trains,), whitened)) if samples else []
     yield [] if any(one.score > samples[0].score for one in pulses) else samples
     deterministic, noises = _deterministic_trials(hypothesis, whitened), _noise_trials(hypothesis, whitened)
     groups = [noises + _as_rivals_of_noise(deterministic), deterministic + _as_rivals(noises)]
@@ -193,8 +199,8 @@ def try_alternatives_to_slow_noise(hypothesis: Hypothesis, whitened: WhitenedAxi
         Axis whitened with ``hypothesis``.
     """
     trials = [one for one in _deterministic_trials(hypothesis, whitened) if one.score_without_slow_noise > 0.0]
-    slow = [*propose_correlated_noise(whitened), *propose_power_law(whitened)]
-    trials += [_noise_trial(hypothesis, effect) for effect in slow]
+    slow = _call_for_axis((propose_correlated_noise, propose_power_law), whitened)
+    trials += _noise_trial_of_each(hypothesis, slow)
     return _best_first([one for one in trials if one.score > 0.0])
 
 
@@ -214,28 +220,32 @@ def _as_rivals_of_noise(deterministic: Sequence[Trial]) -> list[Trial]:
     ]
 
 
-def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
-    statistics = whitened.axis.value_artifacts
-    found: list[Trial] = []
-    changed = find_changed_resolution(whitened)
-    if statistics.quantization and (Resolution not in whitened.effect_types or changed is not None):
-        grid = statistics.quantization
-        resolution = Resolution(step=grid.step.value)
-        trial = _penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels)
-        found.append(replace(trial, moved=changed, replaced=None if changed is None else whitened.effects[changed]))
-    if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.effect_types:
-        ends = statistics.clipping
-        saturation = Saturation(limit=ends.limit.value)
-        found.append(_penalised_trial(saturation, ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count))
-    if statistics.repeats and RandomSampleHold not in whitened.effect_types:
-        twice = statistics.repeats
-        hold = RandomSampleHold(fraction=min(twice.fraction.value, 0.999))
-        intervals = {"fraction": _scaled_bounds(twice.fraction)}
-        found.append(_penalised_trial(hold, twice.gain, intervals, round(twice.count)))
-    return _best_first(found)
+def _resolution_trial(whitened: WhitenedAxis) -> list[Trial]:
+    grid, changed = whitened.axis.value_artifacts.quantization, find_changed_resolution(whitened)
+    if grid is None or (Resolution in whitened.effect_types and changed is None):
+        return []
+    resolution = Resolution(step=grid.step.value)
+    trial = _penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels)
+    return [replace(trial, moved=changed, replaced=None if changed is None else whitened.effects[changed])]
 
 
-def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
+def _saturation_trial(whitened: WhitenedAxis) -> list[Trial]:
+    ends = whitened.axis.value_artifacts.clipping
+    if ends is None or not ends.symmetric or Saturation in whitened.effect_types:
+        return []
+    saturation = Saturation(limit=ends.limit.value)
+    return [_penalised_trial(saturation, ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count)]
+
+
+def _sample_hold_trial(whitened: WhitenedAxis) -> list[Trial]:
+    twice = whitened.axis.value_artifacts.repeats
+    if twice is None or RandomSampleHold in whitened.effect_types:
+        return []
+    hold = RandomSampleHold(fraction=min(twice.fraction.value, 0.999))
+    return [_penalised_trial(hold, twice.gain, {"fraction": _scaled_bounds(twice.fraction)}, round(twice.count))]
+
+
+def _outlier_trial(whitened: WhitenedAxis) -> list[Trial]:
     """Try outliers, unless another cause of heavy tails is as likely.
 
     Samples that are marked as outliers are replaced, so that the diagnostics no longer show the misfit of distant
@@ -250,7 +260,7 @@ def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial
     is_misfit = max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z
     if is_misfit and not is_distant:
         return []
-    unit = _whitened_unit(hypothesis)
+    unit = _whitened_unit(whitened.fit)
     effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
     intervals = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
     trial = _penalised_trial(effect, far.gain, intervals, far.count)
@@ -379,10 +389,10 @@ def _band_gain(whitened: WhitenedAxis) -> float:
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
-def _whitened_unit(hypothesis: Hypothesis) -> float:
+def _whitened_unit(fit: AxisFit) -> float:
     """Return the factor that converts the whitened series to the unit of the axis."""
-    half = hypothesis.axis.bins.count.size // 2
-    count, variance = hypothesis.axis.bins.count[half:], hypothesis.fit.whittle.residual[half:]
+    half = fit.axis.bins.count.size // 2
+    count, variance = fit.axis.bins.count[half:], fit.whittle.residual[half:]
     return float(np.sqrt(variance.sum() / count.sum()))
 
 
@@ -394,6 +404,30 @@ def _penalised_trial(
 
 def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInterval:
     return ParameterInterval(unit * found.value, unit * found.lo, unit * found.hi)
+
+
+def _call_for_axis(
+    functions: Sequence[Callable[[WhitenedAxis], list[Proposed]]], whitened: WhitenedAxis
+) -> list[Proposed]:
+    """Return the results of all functions that do not fail numerically."""
+    return [
+        one
+        for function in functions
+        for one in whitened.axis.evaluate_candidate(
+            function.__name__.removeprefix("propose_").strip("_"), partial(function, whitened), []
+        )
+    ]
+
+
+def _noise_trial_of_each(hypothesis: Hypothesis, effects: Sequence[Effect]) -> list[Trial]:
+    """Return the trials of all noise effects that do not fail numerically."""
+    return [
+        trial
+        for effect in effects
+        for trial in hypothesis.axis.evaluate_candidate(
+            effect.name, lambda effect=effect: [_noise_trial(hypothesis, effect)], list[Trial]()
+        )
+    ]
 
 
 def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
@@ -412,11 +446,12 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
             RETUNE, None, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood - MIN_RESIZE_GAIN_NATS
         )
     ]
-    found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
-    found += _moved_feature_trials(hypothesis, found)
-    found += _low_pass_trials_beside_known_filter(hypothesis)
+    found += _noise_trial_of_each(hypothesis, _call_for_axis(NOISE_CANDIDATES, whitened))
+    reject, none = hypothesis.axis.evaluate_candidate, list[Trial]()
+    found += reject("moved line or resonance", lambda: _moved_feature_trials(hypothesis, found), none)
+    found += reject("changed low-pass filter", lambda: _low_pass_trials_beside_known_filter(hypothesis), none)
     if not hypothesis.axis.is_model_fitted:
-        found.append(_scale_factor_trial(hypothesis, resized))
+        found += reject("scale_factor", lambda: [_scale_factor_trial(hypothesis, resized)], none)
     found = _best_first(found)
     return _prefer_single_size(found) if resized.resized_model_effect_count == 1 else found
 
@@ -520,11 +555,11 @@ def _prefer_single_size(trials: list[Trial]) -> list[Trial]:
 def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Try effects that depend on time, temperature or another axis."""
     free = hypothesis.axis.fit(hypothesis.effects).log_likelihood
-    proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(whitened)]
     kept = [
         effect
-        for effect in proposed
-        if hypothesis.axis.fit((*hypothesis.effects, effect)).log_likelihood - free > 0.3 * PENALTY_NATS[effect.name]
+        for effect in _call_for_axis(DETERMINISTIC_CANDIDATES, whitened)
+        if hypothesis.axis.candidate_log_likelihood((*hypothesis.effects, effect)) - free
+        > 0.3 * PENALTY_NATS[effect.name]
         and (not isinstance(effect, AxisLeak) or _has_flat_coefficient(whitened, effect))
     ]
     if not kept:
@@ -533,15 +568,18 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
     resized = hypothesis.refit_with_other_added_effects(hypothesis.added)
     without = max(resized.penalised_log_likelihood, *(score(hypothesis.effects) for score in slow_noises))
     baseline = without - hypothesis.penalised_log_likelihood
-    trials = []
-    for effect in kept:
+
+    def try_effect(effect: Effect) -> list[Trial]:
         added = refit_correlation_times(hypothesis.axis, (*hypothesis.added, effect), hypothesis.model)
         alone = hypothesis.refit_with_other_added_effects(added).penalised_log_likelihood
         gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
         penalty = PENALTY_NATS[effect.name] + COEFFICIENT_PENALTY_NATS * (len(linear_coefficient_names(effect)) - 1)
         score_alone = alone - hypothesis.penalised_log_likelihood - penalty
-        trials.append(Trial(effect.name, effect, gain - penalty, score_alone, baseline))
-    return _best_first(trials)
+        return [Trial(effect.name, effect, gain - penalty, score_alone, baseline)]
+
+    reject = hypothesis.axis.evaluate_candidate
+    trials = [reject(effect.name, partial(try_effect, effect), list[Trial]()) for effect in kept]
+    return _best_first([trial for tried in trials for trial in tried])
 
 
 def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
@@ -565,7 +603,8 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     fixed_sizes, cost = hypothesis.fit.fixed_sizes, hypothesis.resize_penalty
 
     def make_score_with_added_noise(noise: Effect) -> Callable[[Effects], float]:
-        return lambda effects: axis.fit((*effects, noise), fixed_sizes).log_likelihood - cost - PENALTY_NATS[noise.name]
+        penalty = cost + PENALTY_NATS[noise.name]
+        return lambda effects: axis.candidate_log_likelihood((*effects, noise), fixed_sizes) - penalty
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
@@ -599,3 +638,15 @@ def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     ):
         gain = max(gain, resized.penalised_log_likelihood - hypothesis.penalised_log_likelihood)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), gain)
+
+
+VALUE_TRIALS: Final = (_resolution_trial, _saturation_trial, _sample_hold_trial)
+"""Functions that try the artifacts of the values."""
+SAMPLE_TRIALS: Final = (
+    _outlier_trial,
+    _heavy_tails_trial,
+    _noise_step_trial,
+    _variance_modulation_trial,
+    _wandering_variance_trial,
+)
+"""Functions that try outliers, heavy tails and variations of the noise level."""

@@ -22,6 +22,6 @@ def test_distant_outliers_are_named_if_the_misfit_is_much_smaller_than_their_gai
     hypothesis = fit_with_model_sizes(axis(white(n, rng) + outliers, (WHITE,)), (WHITE,))
     fit = whiten_axis(hypothesis.fit).outlier_fit
     found = replace(fit, misfit_z=(2.0 * misfit_share * fit.gain) ** 0.5, clustering_z=0.0)
-    trials = _outlier_trial(hypothesis, SimpleNamespace(outlier_fit=found, effect_types=frozenset()))
+    trials = _outlier_trial(SimpleNamespace(outlier_fit=found, effect_types=frozenset(), fit=hypothesis.fit))
     assert [trial.name for trial in trials] == [Outliers.name] * named
     assert all(trial.misfit_nats == pytest.approx(misfit_share * fit.gain) for trial in trials)
