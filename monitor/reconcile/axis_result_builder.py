@@ -4,6 +4,8 @@ from dataclasses import replace
 from math import erf, exp, inf, log
 from typing import Final
 
+import numpy as np
+
 from monitor.common.distributions import Z95
 from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import EFFECTS, BandwidthLimit, Outliers, PulseTrain, Sinusoidal, TemperatureBias
@@ -19,6 +21,7 @@ from monitor.reconcile.likelihood.effect_roles import effect_size, linear_coeffi
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, compute_shape_interval, compute_size_interval
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
+    AllanInfluence,
     AlternativeEffect,
     AxisModelDiagnostics,
     AxisResult,
@@ -26,14 +29,15 @@ from monitor.reconcile.result import (
     DiagnosticGap,
     ParameterInterval,
     StepKind,
+    comparable_allan_deviations,
 )
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult, HypothesisDiagnostics, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
 from monitor.reconcile.search.withdrawal_of_contradicted_effects import OSCILLATIONS, share_of_frequencies_covered
 from monitor.reconcile.summary.effect_contributions import (
-    compute_allan_influences_of_changes,
     decompose_explained_gain,
+    find_most_influenced_averaging_times,
     find_original_effects,
     measure_remaining_gaps,
 )
@@ -79,9 +83,7 @@ def build_axis_result(
     snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     changes = _remaining_changes(search)
     gains = decompose_explained_gain(search, fitted_first)
-    influences = (
-        compute_allan_influences_of_changes(search.hypothesis, {index for _, index, _ in changes}) if changes else {}
-    )
+    influences = _allan_influences(search, {index for _, index, _ in changes}, snapshots[0], end) if changes else {}
     left_over = tuple(gap for gap in end.gaps if gap.is_significant)
     steps = []
     for at, index, kind in changes:
@@ -96,6 +98,19 @@ def build_axis_result(
     decision = _axis_decision(bool(steps), bool(left_over))
     remaining = measure_remaining_gaps(search, left_over)
     return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], tuple(steps), left_over, end, remaining)
+
+
+def _allan_influences(
+    search: AxisSearchResult, changed: set[int], start: AxisModelDiagnostics, end: AxisModelDiagnostics
+) -> dict[int, AllanInfluence]:
+    """Return the ratio of the plotted Allan deviations at the averaging time that each change influences most.
+
+    The other changes of the model belong to the ratio, because an added effect often replaces the size of another term.
+    """
+    before, after = comparable_allan_deviations(start, end)
+    ratios = after.expected / before.expected
+    taus_s = find_most_influenced_averaging_times(search.hypothesis, changed)
+    return {at: AllanInfluence(float(np.interp(tau_s, before.x, ratios)), tau_s) for at, tau_s in taus_s.items()}
 
 
 def with_outlier_misfit(search: AxisSearchResult) -> HypothesisDiagnostics:

@@ -285,15 +285,12 @@ def allan_before_and_after_svg(
 ) -> str:
     """Draw the measured Allan deviation, and the Allan deviation of the model before and after the search.
 
-    The result is an SVG element. If the search replaced samples, such as outliers, their share of the measured Allan
-    variance is added to the extended model.
+    The result is an SVG element.
 
     Parameters
     ----------
-    before
-        Allan deviation with the model under test.
-    after
-        Allan deviation with the extended model.
+    before, after
+        Allan deviations of ``comparable_allan_deviations``.
     axis
         Name of the axis.
     marks
@@ -301,9 +298,7 @@ def allan_before_and_after_svg(
     units
         Unit system.
     """
-    replaced = np.fmax(before.measured**2 - after.measured**2, 0.0)
-    curves = {name: np.sqrt(getattr(after, name) ** 2 + replaced) for name in ("measured", "expected", "lo", "hi")}
-    first, last = (to_displayed_units("", view, axis, None, units) for view in (before, replace(after, **curves)))
+    first, last = (to_displayed_units("", view, axis, None, units) for view in (before, after))
     with style.figure_style():
         figure = style.create_figure(*ALLAN_INCHES)
         panel = figure.subplots()

@@ -6,7 +6,7 @@ that agrees is shown as one collapsible line. The comparison contains a summary,
 noise effects that were found. If an effect was not found in a recording, the page states why it may be absent.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import log
 from typing import Final
@@ -31,7 +31,9 @@ from monitor.reconcile.result import (
     AxisModelDiagnostics,
     AxisResult,
     DiagnosticGap,
+    DiagnosticPlotData,
     Reconciliation,
+    comparable_allan_deviations,
 )
 from monitor.reconcile.several_recordings.comparison import EffectInRecordings, RecordingsComparison
 from monitor.reconcile.summary import summary_sentences
@@ -44,6 +46,15 @@ DETAIL_INCHES: Final = (3.33, 3.3)
 PANEL_INCHES: Final = (3.4, 2.35)
 MIN_MARKED_LOG_RATIO: Final = 0.01
 """Smallest logarithmic change of the Allan deviation that is marked, about the width of a line in the figure."""
+
+
+@dataclass(frozen=True, slots=True)
+class _ShownRange:
+    """Difference of one diagnostic, and the plot data that show its range."""
+
+    gap: DiagnosticGap
+    before: DiagnosticPlotData | None
+    after: DiagnosticPlotData | None  # after the search
 
 
 def render_page(r: Reconciliation, title: str = "", units: UnitSystem = DEFAULT_UNITS) -> str:
@@ -86,7 +97,7 @@ def render_page(r: Reconciliation, title: str = "", units: UnitSystem = DEFAULT_
         effects=EFFECTS,
         figures=reconcile_figures,
         colours=style,
-        snapshots=_snapshots,
+        ranges=_ranges,
         gaps_by_diagnostic=_gaps_by_diagnostic,
         draw_range=partial(_draw_range, units=units),
         draw_other_diagnostics=partial(_draw_other_diagnostics, units=units),
@@ -112,22 +123,16 @@ def draw_differing_allan_deviations(
     ConfigError
         If matplotlib is not installed.
     """
-    drawn = (_draw_allan(result, ranking, units) for result in _sort_by_axis(r) if result.verdict != "agrees")
-    return [figure for figure in drawn if figure is not None]
+    return [_draw_allan(result, ranking, units) for result in _sort_by_axis(r) if result.verdict != "agrees"]
 
 
 def _sort_by_axis(r: Reconciliation) -> list[AxisResult]:
     return [r.axes[axis] for axis in AXES if axis in r.axes]
 
 
-def _draw_allan(result: AxisResult, ranking: GapRanking, units: UnitSystem) -> str | None:
+def _draw_allan(result: AxisResult, ranking: GapRanking, units: UnitSystem) -> str:
     """Draw the Allan deviation before and after the search. The marks are the numbers of the findings."""
-    before, after = (
-        next((view for view in snapshot.plots if view.diagnostic == "allan"), None)
-        for snapshot in (result.start, result.end)
-    )
-    if before is None or after is None:
-        return None
+    before, after = comparable_allan_deviations(result.start, result.end)
     marks: dict[float, str] = {}
     for number, one in enumerate(ranking.findings, start=1):
         influence = one.influences.get(result.axis)
@@ -157,11 +162,7 @@ def _draw_other_diagnostics(result: AxisResult, units: UnitSystem) -> list[tuple
     if result.verdict == "agrees":
         views = [view for view in result.start.plots if view.diagnostic == "allan"]
         return [(1, diagnostic_comparison_svg([("", view)], result.axis, *PANEL_INCHES, units=units)) for view in views]
-    found = [
-        *((before, step.before) for before, step in zip(_snapshots(result), result.steps, strict=False)),
-        *((result.end, gap) for gap in result.left_over),
-    ]
-    shown = {id(select_diagnostic_view(snapshot.plots, gap.diagnostic, gap.where)) for snapshot, gap in found}
+    shown = {id(view) for one in _ranges(result) for view in (one.before, one.after)}
     significant = {gap.diagnostic for gap in result.start.gaps if gap.is_significant} - {"allan"}
     ends = [("before", result.start), ("after", result.end)] if result.steps else [("", result.start)]
     drawn = []
@@ -176,17 +177,41 @@ def _draw_other_diagnostics(result: AxisResult, units: UnitSystem) -> list[tuple
     return drawn
 
 
-def _draw_range(snapshot: AxisModelDiagnostics, found: DiagnosticGap, axis: str, units: UnitSystem) -> list[str]:
-    view = select_diagnostic_view(snapshot.plots, found.diagnostic, found.where)
-    if view is None:
+def _ranges(result: AxisResult) -> list[_ShownRange]:
+    """Return the range of each step, and then of each remaining difference, with the diagnostics that show it.
+
+    A range is shown before its step and, if no later figure shows the same diagnostic, after the search.
+    """
+    gaps = [*zip(_snapshots(result), (step.before for step in result.steps), strict=False)]
+    gaps += [(result.end, gap) for gap in result.left_over]
+    views = [select_diagnostic_view(snapshot.plots, gap.diagnostic, gap.where) for snapshot, gap in gaps]
+    found = []
+    for at, ((_, gap), view) in enumerate(zip(gaps, views, strict=True)):
+        after = None
+        if view is not None and view.diagnostic not in {later.diagnostic for later in views[at + 1 :] if later}:
+            after = next((one for one in result.end.plots if one.diagnostic == view.diagnostic), None)
+        found.append(_ShownRange(gap, view, after if at < len(result.steps) else None))
+    return found
+
+
+def _draw_range(shown: _ShownRange, axis: str, units: UnitSystem) -> list[str]:
+    """Draw a range and, if it is narrow, its surroundings in detail. The figures are side by side or a column."""
+    if shown.before is None:
         return []
-    draw, detail = partial(diagnostic_comparison_svg, axis=axis, units=units), zoomed_view(view, found.where)
+    where = shown.gap.where
+    draw, detail = partial(diagnostic_comparison_svg, axis=axis, units=units), zoomed_view(shown.before, where)
+    width, height = RANGE_INCHES
+    if shown.after is not None:
+        panels = [[("before", shown.before), ("after", shown.after)]]
+        detail_after = zoomed_view(shown.after, where)
+        if detail is not None and detail_after is not None:
+            panels.append([("before", detail), ("after", detail_after)])
+        return ["".join(draw(pair, width=width, height=height, where=where) for pair in panels)]
     if detail is None:
-        width, height = RANGE_INCHES
-        return [draw([("", view)], width=width, height=height, where=found.where)]
+        return [draw([("", shown.before)], width=width, height=height, where=where)]
     (width, height), (detail_width, detail_height) = RANGE_WITH_DETAIL_INCHES, DETAIL_INCHES
-    whole = draw([("", view)], width=width, height=height, where=replace(found.where, source=None))
-    return [whole, draw([("", detail)], width=detail_width, height=detail_height, where=found.where)]
+    whole = draw([("", shown.before)], width=width, height=height, where=replace(where, source=None))
+    return [whole, draw([("", detail)], width=detail_width, height=detail_height, where=where)]
 
 
 def render_comparison_page(c: RecordingsComparison, units: UnitSystem = DEFAULT_UNITS) -> str:

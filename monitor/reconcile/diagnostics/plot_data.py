@@ -12,15 +12,23 @@ from scipy.special import chdtri, erfc
 from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
+from monitor.noise.effects import RandomSampleHold
 from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.whiteness_tests import MAX_LAG_SAMPLES, compute_autocorrelation
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, relative_noise_std_over_time
-from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
+from monitor.reconcile.preparation.cosine_bins import FrequencyBins, inverse_cosine_transform
+from monitor.reconcile.preparation.value_artifacts import RepeatedSamples
 from monitor.reconcile.result import DiagnosticPlotData
 
 SPECTRUM_POINTS: Final = 240
 TIME_BLOCKS: Final = 240
 TEMPERATURE_BINS: Final = 24
+MAX_RUN_SAMPLES: Final = 60
+"""Length of the longest run of equal values in the plot."""
+MIN_RUNS: Final = 0.3
+"""Smallest number of runs in the plot, whose axis is logarithmic."""
+MAX_CHANCE_RUNS: Final = 3.0
+"""Upper end of the 95 % interval of the expected number if no run is expected."""
 LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the samples by the first letter of the axis."""
 
@@ -38,6 +46,8 @@ def build_plot_data(whitened: WhitenedAxis) -> tuple[DiagnosticPlotData, ...]:
     ]
     if whitened.axis.temperature_c is not None and np.ptp(whitened.axis.temperature_c) > 0.0:
         plots.append(_plot_level_over_temperature(whitened, fitted, whitened.axis.temperature_c))
+    if whitened.axis.value_artifacts.repeats is not None:
+        plots.append(_plot_runs_of_equal_values(whitened, whitened.axis.value_artifacts.repeats))
     return tuple(plots)
 
 
@@ -76,17 +86,35 @@ def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> DiagnosticP
     measured, _ = overlapping_avar_axis(axis.repaired, m)
     deterministic = overlapping_avar_axis(fitted, m)[0] if fitted.any() else np.zeros(m.size)
     tau_s = np.asarray(m * tau0_s, np.float64)
-    noise = allan_variance_of_density(_density_function(whitened), tau_s, tau0_s, ())
+    density = interpolated_density(axis.bins, whitened.fit.whittle.variance)
+    noise = allan_variance_of_density(density, tau_s, tau0_s, ())
     lo, hi = _chi2_band(_allan_degrees_of_freedom(whitened, m))
     curves = (measured, noise + deterministic, lo * noise + deterministic, hi * noise + deterministic)
     names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(whitened))
     return DiagnosticPlotData(*names, True, tau_s, *(np.sqrt(avar) for avar in curves))
 
 
-def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
-    bins = whitened.axis.bins
-    x, y = np.log(bins.f_hz), np.log(whitened.fit.whittle.variance / whitened.axis.rate_hz)
-    return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
+def interpolated_density(bins: FrequencyBins, variance: Floats) -> Callable[[Floats], Floats]:
+    """Return the spectral density of a model as a function of the frequency in Hz.
+
+    Below the first bin, the density continues with the slope between the first two bins. Otherwise, the Allan deviation
+    of a random walk would be too small at the longest averaging times.
+
+    Parameters
+    ----------
+    bins : FrequencyBins
+        Frequency bins.
+    variance : ndarray of float64, shape (m,)
+        Variance of a coefficient in each bin.
+    """
+    x, y = np.log(bins.f_hz), np.log(variance / bins.rate_hz)
+    slope = (y[1] - y[0]) / (x[1] - x[0])
+
+    def density(f_hz: Floats) -> Floats:
+        log_f = np.log(f_hz)
+        return np.asarray(np.exp(np.interp(log_f, x, y) + slope * np.minimum(log_f - x[0], 0.0)))
+
+    return density
 
 
 def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
@@ -177,6 +205,27 @@ def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, tempera
     return DiagnosticPlotData(
         *names, False, middle, temperature_bin_means(axis.repaired), expected, expected - spread, expected + spread
     )
+
+
+def _plot_runs_of_equal_values(whitened: WhitenedAxis, repeats: RepeatedSamples) -> DiagnosticPlotData:
+    """Plot the number of runs of equal values that are at least as long as k samples.
+
+    If the share q of the n samples equals the previous sample, n (1 − q) qᵏ⁻¹ runs have at least k samples. A model
+    with the fraction g of repeated samples has q = g + (1 − g) p, where p is the share of equal neighbours by chance.
+    """
+    raw, found = whitened.axis.raw, repeats.fraction.value
+    same = raw[1:] == raw[:-1]
+    chance = max((float(same.mean()) - found) / (1.0 - found), 0.0) if found < 1.0 else 0.0
+    fraction = sum(effect.fraction for effect in whitened.effects if isinstance(effect, RandomSampleHold))
+    equal = fraction + (1.0 - fraction) * chance
+    lengths = np.diff(np.concatenate([[0], np.flatnonzero(~same) + 1, [raw.size]]))
+    k = np.arange(1, min(int(lengths.max()), MAX_RUN_SAMPLES) + 1)
+    measured = (lengths[None] >= k[:, None]).sum(axis=1).astype(np.float64)
+    expected = raw.size * (1.0 - equal) * equal ** (k - 1.0)
+    spread = Z95 * np.sqrt(expected)
+    lo, hi = np.maximum(expected - spread, MIN_RUNS), np.maximum(expected + spread, MAX_CHANCE_RUNS)
+    names = ("values", "run of equal values", "samples", "runs at least as long", "1")
+    return DiagnosticPlotData(*names, True, k.astype(np.float64), measured, np.maximum(expected, MIN_RUNS), lo, hi)
 
 
 def _level_unit(whitened: WhitenedAxis) -> str:

@@ -1,4 +1,4 @@
-"""Contribution of each change of the model to the gap and to the Allan deviation of an axis.
+"""Contribution of each change of the model to the gap of an axis, and averaging time that the change influences most.
 
 The **explained gap** is the gain in log-likelihood of the final hypothesis over the model under test. The gain is
 distributed among the changes of the model: in each step, the change whose removal costs least is removed, the remaining
@@ -18,7 +18,7 @@ fitting the power in each of ``SATURATED_BANDS`` frequency bands is used if it i
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from math import exp, inf, log
+from math import inf, log
 from typing import Final
 
 import numpy as np
@@ -41,13 +41,14 @@ from monitor.noise.effects import (
     WanderingVariance,
 )
 from monitor.noise.spectrum import allan_variance_of_density
+from monitor.reconcile.diagnostics.plot_data import interpolated_density
 from monitor.reconcile.diagnostics.whiteness_tests import fitted_variance_gain_nats
 from monitor.reconcile.effect_properties import EFFECT_PROPERTIES, SIZE_PARAMETERS
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_roles import regression_coefficients
 from monitor.reconcile.likelihood.hypothesis_fit import Hypothesis, noise_effect_indices
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
-from monitor.reconcile.result import AllanInfluence, DiagnosticGap, RemainingGap
+from monitor.reconcile.result import DiagnosticGap, RemainingGap
 from monitor.reconcile.search.backward_elimination import changed_sizes
 from monitor.reconcile.search.search import AxisSearchResult
 from monitor.reconcile.search.trials import Trial
@@ -74,10 +75,12 @@ EFFECTS_OUTSIDE_SPECTRUM: Final = (
 """Effects that are not fully visible in the likelihood of the spectrum."""
 SATURATED_BANDS: Final = 64
 """Number of frequency bands with a separately fitted power, equally wide on a logarithmic scale."""
+MIN_AVAR: Final = 1e-300
+"""Smallest Allan variance in a ratio. The variance is zero if the model without the change has no noise."""
+LARGEST_INFLUENCE_SHARE: Final = 0.98
+"""Share of the largest influence at which an averaging time is preferred because it is shorter."""
 MAX_STEP_NOISE_SHARE: Final = 0.9
 """Largest share of the variance that quantization noise is assumed to have."""
-MAX_LOG_RATIO: Final = 10.0
-"""Largest absolute logarithm of a ratio. The ratio is infinite if the model without the change has no noise."""
 
 
 def decompose_explained_gain(search: AxisSearchResult, fitted_first: bool) -> dict[int, float]:
@@ -243,8 +246,8 @@ def _saturated_spectrum_gain(fit: AxisFit) -> float:
     return float(fitted_variance_gain_nats(power / count, count).sum() - 0.5 * first.size)
 
 
-def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterable[int]) -> dict[int, AllanInfluence]:
-    """Compute the influence of each changed effect on the Allan deviation.
+def find_most_influenced_averaging_times(hypothesis: Hypothesis, changed: Iterable[int]) -> dict[int, float]:
+    """Find the averaging time at which each changed effect influences the Allan deviation most.
 
     The Allan deviation of the extended model is compared with the Allan deviation of the model without the change. All
     other sizes stay the same. Cross products of deterministic effects are neglected.
@@ -258,9 +261,9 @@ def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterabl
 
     Returns
     -------
-    dict of int to AllanInfluence
-        Influence of each effect, by its index. A changed size is compared with the old size. For a moved line or an
-        added effect, the reference is the model without this line or effect.
+    dict of int to float
+        Averaging time of each effect in seconds, by its index. A changed size is compared with the old size. For a
+        moved line or an added effect, the reference is the model without this line or effect.
     """
     resized = changed_sizes(hypothesis)
     axis, effects = hypothesis.axis, hypothesis.effects
@@ -270,7 +273,7 @@ def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterabl
         at: _deterministic_avar(hypothesis.fit, place, effects[at], factors) for at, place in places.items()
     }
     total = _noise_avar(hypothesis, effects, factors) + sum(deterministic.values())
-    found: dict[int, AllanInfluence] = {}
+    found: dict[int, float] = {}
     for at in changed:
         if at in deterministic:
             without = total - deterministic[at]
@@ -280,11 +283,9 @@ def compute_allan_influences_of_changes(hypothesis: Hypothesis, changed: Iterabl
             old = (hypothesis.model[at],) if at in resized else ()
             rest = (*effects[:at], *old, *effects[at + 1 :])
             without = _noise_avar(hypothesis, rest, factors) + sum(deterministic.values())
-        with np.errstate(divide="ignore", invalid="ignore"):
-            log_ratio = np.nan_to_num(0.5 * np.log(total / np.maximum(without, 0.0)), posinf=MAX_LOG_RATIO)
-        largest = int(np.argmax(np.abs(log_ratio)))
-        ratio = exp(float(np.clip(log_ratio[largest], -MAX_LOG_RATIO, MAX_LOG_RATIO)))
-        found[at] = AllanInfluence(ratio, float(factors[largest] / axis.rate_hz))
+        influence = np.abs(np.log(np.maximum(total, MIN_AVAR) / np.maximum(without, MIN_AVAR)))
+        nearly_largest = influence >= LARGEST_INFLUENCE_SHARE * influence.max()  # everywhere, for white noise
+        found[at] = float(factors[int(np.argmax(nearly_largest))] / axis.rate_hz)
     return found
 
 
@@ -293,12 +294,12 @@ def _noise_avar(hypothesis: Hypothesis, effects: Effects, factors: Ints) -> Floa
     axis = hypothesis.axis
     tau0_s = 1.0 / axis.rate_hz
     variance = axis.fit(effects, noise_effect_indices(effects)).whittle.variance
-    x, y = np.log(axis.bins.f_hz), np.log(variance * tau0_s)
+    fitted = interpolated_density(axis.bins, variance)
     others = [one for one in effects if isinstance(one, Source) and one.name not in SIZE_PARAMETERS]
 
     def density(f_hz: Floats) -> Floats:
         added = sum(np.nan_to_num(one.two_sided_psd(f_hz, tau0_s)) for one in others)
-        return np.asarray(np.exp(np.interp(np.log(f_hz), x, y)) + added)
+        return np.asarray(fitted(f_hz) + added)
 
     return allan_variance_of_density(density, np.asarray(factors * tau0_s, np.float64), tau0_s, ())
 

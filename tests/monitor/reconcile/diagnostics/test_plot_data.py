@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.special import erfc
 
+from monitor.noise.effects import RandomSampleHold
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.diagnostics.plot_data import build_plot_data
 from tests.monitor.reconcile.axes import (
@@ -142,3 +143,18 @@ def test_correlation_of_adjacent_samples_is_measured():
     y = draw_noise(6)
     y[1:] += 0.5 * y[:-1]
     assert drawn(y)["autocorrelation"].measured[0] > 10 * view.hi[0]
+
+
+@pytest.mark.parametrize("step", [0.0, 0.5])
+def test_runs_of_equal_values_are_compared_with_the_fraction_of_the_model(step):
+    rng = np.random.default_rng(7)
+    y = white(n, rng)
+    if step:
+        y = step * N * RATE_HZ**0.5 * np.rint(y / (step * N * RATE_HZ**0.5))
+    for at in np.flatnonzero(rng.random(n) < 0.2):
+        y[at] = y[at - 1] if at else y[at]
+    before = drawn(y, (WHITE,))["values"]
+    assert (before.measured > before.hi)[1:4].all()
+    after = drawn(y, (WHITE, RandomSampleHold(fraction=0.2)))["values"]
+    assert after.measured[:4] == pytest.approx(after.expected[:4], rel=0.15)
+    assert "values" not in drawn(draw_noise())
