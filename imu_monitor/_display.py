@@ -10,7 +10,8 @@ from drivers.host.extras import install_command
 
 if TYPE_CHECKING:
     import pandas as pd
-    from rich.console import Console
+
+    from monitor.publishing.terminal.console import Console
 
 WIDTH: Final = 120
 """Width of printed results in characters."""
@@ -24,7 +25,7 @@ def render_text(print_result: "Callable[[Console], None]") -> str:
     print_result
         Function that prints to the console that it receives.
     """
-    from rich.console import Console
+    from monitor.publishing.terminal.console import Console
 
     text = io.StringIO()
     print_result(Console(file=text, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False))

@@ -36,10 +36,9 @@ def compensate(
     loading: options.Loading = None,
 ) -> None:
     """Remove the gyro drift from a recording, and write the compensated recording."""
-    from rich.console import Console
-
     from monitor.commands import compensate as compensating
     from monitor.publishing.terminal import compensate_output as text
+    from monitor.publishing.terminal.console import Console
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)

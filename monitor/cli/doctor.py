@@ -34,9 +34,10 @@ def doctor(
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from monitor.publishing.terminal.console import Console
 
     table = Table(box=None, show_header=False, pad_edge=False)
     for column in ("sign", "about", "text"):

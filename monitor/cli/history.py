@@ -59,8 +59,6 @@ def history(
     units: options.Units = "imu",
 ) -> None:
     """Print past coefficients, temperatures, lost samples and events over a period of hours to years."""
-    from rich.console import Console
-
     from drivers.data_types import AXES
     from drivers.recordings.formats import find_writer
     from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
@@ -68,6 +66,7 @@ def history(
     from monitor.history.query_parameters import PARTS, HistoryQuery
     from monitor.history.time_ranges import parse_duration_s
     from monitor.publishing.terminal import history_text
+    from monitor.publishing.terminal.console import Console
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')

@@ -38,12 +38,11 @@ def reconcile(
 ) -> None:
     """Compare recordings with a noise model, and find the effects that are missing from the model."""
     require_extra("reconcile", "reconcile")
-    from rich.console import Console
-
     from monitor.commands import reconcile as reconciling
     from monitor.common.heap_memory import keep_freed_memory
     from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
+    from monitor.publishing.terminal.console import Console
     from monitor.reconcile import json_report
 
     unit_system = options.parse_units(units)

@@ -31,10 +31,9 @@ def thermal_fit(
     loading: options.Loading = None,
 ) -> None:
     """Fit the bias of each axis as a function of the temperature and its history."""
-    from rich.console import Console
-
     from monitor.commands import thermal
     from monitor.publishing.terminal import thermal_output as text
+    from monitor.publishing.terminal.console import Console
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)
@@ -66,10 +65,9 @@ def thermal_predict(
     loading: options.Loading = None,
 ) -> None:
     """Predict the bias of another recording with a model, and print the errors of the prediction."""
-    from rich.console import Console
-
     from monitor.commands import thermal
     from monitor.publishing.terminal import thermal_output as text
+    from monitor.publishing.terminal.console import Console
 
     output.check_output_file("--plot", plot, ".png")
     unit_system = options.parse_units(units)

@@ -31,8 +31,7 @@ def watch(
 
         print_messages_as_json(keyexpr, connect or (), stop, sys.stdout, sys.stderr, seconds, zenoh)
         return
-    from rich.console import Console
-
+    from monitor.publishing.terminal.console import Console
     from monitor.publishing.terminal.watch import watch as show
 
     show(keyexpr, connect or (), stop, Console(), seconds, zenoh, unit_system)

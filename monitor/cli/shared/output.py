@@ -96,8 +96,9 @@ def print_written_files(*paths: Path | None) -> None:
 @contextlib.contextmanager
 def show_progress_bar() -> Iterator[ProgressCallback]:
     """Show a progress bar if the output is a terminal, and yield a callback that updates the progress bar."""
-    from rich.console import Console
     from rich.progress import Progress
+
+    from monitor.publishing.terminal.console import Console
 
     console = Console(stderr=True)
     if not (console.is_terminal and sys.stdout.isatty()):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 from drivers.errors import ConfigError
 from drivers.zenoh.credential_masking import mask_secrets
 from monitor.cli.shared.errors import name_option_in_config_errors
+from monitor.common.control_characters import remove_control_characters
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
@@ -55,7 +56,6 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     import threading
 
     import structlog
-    from rich.console import Console
 
     from monitor.common.unit_formatting import UNIT_SYSTEMS
     from monitor.daemon.daemon_process import STATUS_INTERVAL_S, DaemonProcess
@@ -65,6 +65,7 @@ def run_service(config: "Config", seconds: float | None, viewer_mode: str | None
     from monitor.daemon.workers.device_spreading import count_workers
     from monitor.daemon.workers.supervisor import WorkerSupervisor
     from monitor.publishing.remote_device_states import RemoteDeviceRegistry
+    from monitor.publishing.terminal.console import Console
     from monitor.publishing.terminal.live_device_table import LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
@@ -297,7 +298,7 @@ def _configure_logging(config: "Config") -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            _without_secrets,
+            _without_secrets_and_control_characters,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _StderrIgnoringWriteErrors())),
@@ -306,8 +307,13 @@ def _configure_logging(config: "Config") -> None:
     set_log_level(config.log.level)
 
 
-def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":
-    return {key: mask_secrets(value) if isinstance(value, str) else value for key, value in line.items()}
+def _without_secrets_and_control_characters(
+    _logger: Any, _method: str, line: "MutableMapping[str, Any]"
+) -> "MutableMapping[str, Any]":
+    texts = {
+        key: remove_control_characters(mask_secrets(value)) for key, value in line.items() if isinstance(value, str)
+    }
+    return {**line, **texts}
 
 
 def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], None] | None = None) -> None:

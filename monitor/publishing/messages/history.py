@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Ints
 from monitor.common import topics
+from monitor.common.control_characters import remove_control_characters
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.history.bucketed_history import MAX_EVENTS, ColumnStatistics, HistoryTable
 from monitor.history.history_row import COUNTS, STATES
@@ -26,7 +27,6 @@ from monitor.publishing.messages.message import (
     Message,
     attributes_with_field_names,
     decode_message,
-    remove_control_characters,
 )
 
 MAX_BUCKETS: Final = 1_000_000

@@ -113,15 +113,6 @@ def _shared_names(names: tuple[str, ...], source_type: type) -> tuple[str, ...]:
     return tuple(name for name in names if name in own)
 
 
-def remove_control_characters(text: str) -> str:
-    """Replace control characters, which a terminal would interpret, with spaces.
-
-    >>> remove_control_characters("link\\x1b[2J lost\\nnow")
-    'link [2J lost now'
-    """
-    return "".join(one if one.isprintable() else " " for one in text)
-
-
 def _encode_array(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

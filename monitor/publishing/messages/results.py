@@ -13,6 +13,7 @@ from drivers.data_types import AXES, Event, Floats
 from drivers.validation.number_ranges import RATE_HZ
 from drivers.zenoh.credential_masking import mask_secrets
 from monitor.common import topics
+from monitor.common.control_characters import remove_control_characters
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
@@ -26,7 +27,6 @@ from monitor.publishing.messages.message import (
     Message,
     attributes_with_field_names,
     decode_message,
-    remove_control_characters,
 )
 
 MAX_AVERAGING_TIMES: Final = 1000

@@ -4,12 +4,13 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError
 from drivers.host.extras import install_command
+from monitor.common.control_characters import remove_control_characters
 
 MISSING_MESSAGE: Final = f"Jinja2 is not installed: {install_command('imu-monitor[plot]')}"
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Return the HTML page that a template gives for the given values.
+    """Return the HTML page that a template gives for the given values, without control characters.
 
     Parameters
     ----------
@@ -34,4 +35,4 @@ def render_template(name: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(name).render(**values)
+    return remove_control_characters(environment.get_template(name).render(**values), "\n")

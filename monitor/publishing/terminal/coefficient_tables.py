@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -26,6 +26,7 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.remote_device_states import DeviceCoefficients
+from monitor.publishing.terminal.console import Console
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table, print_notes
 
 K_OR_R: Final = "K or R"

@@ -19,6 +19,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from monitor.common.control_characters import remove_control_characters
 from monitor.common.unit_formatting import (
     DEFAULT_UNITS,
     KINDS,
@@ -35,7 +36,6 @@ from monitor.common.unit_formatting import (
 )
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.publishing.coefficient_cells import format_coefficient
-from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
 from monitor.publishing.remote_device_states import (
     MAX_DEVICES,

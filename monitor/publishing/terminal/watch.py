@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final, TextIO, cast
 
 import msgspec
-from rich.console import Console
 
 from drivers.data_types import AXES, ns_to_seconds
 from drivers.errors import DecodeError
@@ -24,6 +23,7 @@ from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.publishing.messages.message import MAX_PAYLOAD_BYTES, decode_message, encode_json
 from monitor.publishing.messages.results import AllanMessage
 from monitor.publishing.remote_device_states import RemoteDeviceRegistry, split_device_and_topic
+from monitor.publishing.terminal.console import Console
 from monitor.publishing.terminal.live_device_table import LiveTable, device_overview
 from monitor.publishing.terminal.queued_writer import QueuedWriter, reader_is_gone
 from monitor.publishing.zenoh.subscriber import (

@@ -14,9 +14,9 @@ from drivers.zenoh.connection_diagnosis import explain_refusals
 from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
+from monitor.common.control_characters import remove_control_characters
 from monitor.history.bucketed_history import HistoryTable
 from monitor.publishing.messages.history import decode_history
-from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.remote_device_states import split_device_and_topic
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber, client_configurations
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from monitor.common.control_characters import remove_control_characters
 from monitor.common.device_health import Health
 from monitor.common.unit_formatting import (
     DEFAULT_UNITS,
@@ -27,7 +28,6 @@ from monitor.drift.compensation.live_compensation import MeasuredAndSubtractedDr
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients
 from monitor.publishing.coefficient_cells import format_coefficient, format_relative_interval
-from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import measured_axes
 from monitor.publishing.remote_device_states import RemoteDevice
 
