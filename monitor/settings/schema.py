@@ -180,7 +180,7 @@ class Device(SettingsModel):
     reconcile_folder: RelativePath | None = Field(
         None,
         examples=["reports"],
-        description="folder for the reports of command/reconcile; absent: the reports are not kept",
+        description="folder for the newest 20 reports of command/reconcile; absent: the reports are not kept",
     )
     frame_id: FrameId = Field(FRAME_ID, description="coordinate frame of the samples in ROS 2")
     axes: Annotated[AxisMap, ConvertedFrom(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(

@@ -5,13 +5,15 @@ process. A separate process is used because a fit takes seconds to minutes. The 
 result, and the device publishes an event. Each device has at most one reconciliation at a time.
 
 The query cannot choose the folder of the report, because anyone on the network may send a query. The report is kept in
-a new folder inside ``reconcile_folder``. If the data do not support an answer, the result contains ``exit`` 3 and a
-reason.
+a new folder inside ``reconcile_folder``. The oldest reports of a device are deleted. If the data do not
+support an answer, the result contains ``exit`` 3 and a reason.
 """
 
 import contextlib
 import os
 import queue
+import re
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -44,6 +46,8 @@ DONE: Final = 0
 """Exit status of a successful reconciliation."""
 NO_ANSWER: Final = 3
 """Exit status if the data do not support an answer."""
+KEPT_REPORTS: Final = 20
+"""Number of newest reports of a device that are kept in ``reconcile_folder``."""
 JOIN_TIMEOUT_S: Final = 3.0
 """Longest wait for a thread when the service ends."""
 
@@ -132,7 +136,7 @@ class Reconciler:
             self._finished.put(ReconciliationOutcomeText(job.device, f"reconcile failed: {error}"))
             return
         head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
-        command.reply_result(head.encode_report(result, status, folder))
+        command.reply_result(head.encode_report(result, status, folder, KEPT_REPORTS))
         self._finished.put(ReconciliationOutcomeText(job.device, describe_reconcile_result(result, status)))
 
     def _reconcile(self, job: WindowCopyForReconcile) -> tuple[dict[str, Any], int, str | None]:
@@ -147,7 +151,11 @@ class Reconciler:
             options = ["--out", str(folder), "--json", "-", "--seed", str(SEED)]
             if job.model is not None:
                 options += ["--model", str(job.model)]
-            status, output, errors = self._run_child(job.device, [*self._program, str(path), *options])
+            try:
+                status, output, errors = self._run_child(job.device, [*self._program, str(path), *options])
+            finally:
+                if job.folder is not None:
+                    _delete_old_reports(job.folder, job.device)
         if status not in (DONE, NO_ANSWER):
             lines = errors.decode("utf-8", "replace").strip().splitlines()
             raise RuntimeError(lines[-1] if lines else f"reconcile ended with status {status}")
@@ -177,6 +185,14 @@ class Reconciler:
         if self._closing.is_set():
             raise RuntimeError("the service is stopping")
         return child.returncode, output, errors
+
+
+def _delete_old_reports(folder: Path, device: str) -> None:
+    """Delete the oldest reports of a device and keep ``KEPT_REPORTS``. The name of a report contains its time."""
+    name = re.compile(rf"{re.escape(device)}-\d{{8}}T\d{{6}}Z")
+    reports = sorted(path for path in folder.iterdir() if name.fullmatch(path.name) and not path.is_symlink())
+    for path in reports[:-KEPT_REPORTS]:
+        shutil.rmtree(path)
 
 
 def _write_window(path: Path, job: WindowCopyForReconcile) -> None:

@@ -480,7 +480,9 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
 
     topic = topics.RECONCILE
 
-    def encode_report(self, report: Mapping[str, Any], exit_status: int, folder: str | None) -> bytes:
+    def encode_report(
+        self, report: Mapping[str, Any], exit_status: int, folder: str | None, kept_reports: int
+    ) -> bytes:
         """Encode the reply and the report as one JSON object.
 
         Parameters
@@ -491,10 +493,13 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
             Exit status of the command ``reconcile``.
         folder
             Folder that contains the complete report. None if the report was not saved.
+        kept_reports
+            Number of newest reports of the device that are kept.
         """
+        kept = {} if folder is None else {"kept_reports": kept_reports}
         head = msgspec.to_builtins(self)
         keys = {key: value for key, value in report.items() if key not in head}
-        return msgspec.json.encode({**head, **keys, "exit": exit_status, "folder": folder})
+        return msgspec.json.encode({**head, **keys, "exit": exit_status, "folder": folder, **kept})
 
 
 def coefficient_values(

@@ -5,6 +5,7 @@ import os
 import sys
 import textwrap
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from drivers.data_types import make_block
 from drivers.recordings import load_samples
 from monitor.daemon.operations.reconcile_on_request import (
     COMMAND,
+    KEPT_REPORTS,
     NICENESS_INCREASE,
     Reconciler,
     WindowCopyForReconcile,
@@ -133,6 +135,24 @@ def test_unmeasured_axes_are_not_in_the_recording(tmp_path: Path) -> None:
     )
     assert query.answers[0]["found"] == ["ax", "az", "fs", "gx", "gy", "gz"]
     assert "--model" not in query.answers[0]
+
+
+def test_oldest_reports_of_the_device_are_deleted(tmp_path: Path) -> None:
+    started_s = 1_763_700_000
+    reconciler = Reconciler(make_command("os.makedirs(arguments['--out'], exist_ok=True); print('{}')"))
+    others = [tmp_path / name for name in ("bench-1-2-20200101T000000Z", "bench-1-notes", "other-20200101T000000Z")]
+    for other in others:
+        other.mkdir()
+    folders = []
+    for run in range(KEPT_REPORTS + 3):
+        query = ReconcileQuery()
+        window_copy = replace(make_window_copy(folder=tmp_path), unix_s=float(started_s + run))
+        wait_for(lambda: not any(thread.is_alive() for thread in reconciler._running.values()))
+        reconciler.start_reconciliation(window_copy, query.command)
+        (answer,) = query.wait().answers
+        assert answer["kept_reports"] == KEPT_REPORTS
+        folders.append(Path(answer["folder"]))
+    assert sorted(tmp_path.iterdir()) == sorted([*others, *folders[-KEPT_REPORTS:]])
 
 
 def test_result_without_verdict_is_answered() -> None:

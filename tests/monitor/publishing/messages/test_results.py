@@ -67,7 +67,7 @@ PAYLOADS = {
     topics.STATUS: StatusMessage.from_result("bench-1", UNIX_S, 0, example_results.make_health()).encode(),
     topics.RESET: ResetReply.from_result("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
     topics.RECONCILE: ReconcileReply(device="bench-1", t=UNIX_S, samples=360_000).encode_report(
-        {"schema": "x", "verdict": "agrees"}, 0, None
+        {"schema": "x", "verdict": "agrees"}, 0, None, 20
     ),
 }
 
@@ -169,7 +169,7 @@ def test_unknown_model_value_is_null() -> None:
 
 def test_report_keys_are_kept_except_the_common_ones() -> None:
     result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
-    found = parse_json(ReconcileReply(device="a", t=UNIX_S, samples=360_000).encode_report(result, 3, "/reports/a"))
+    found = parse_json(ReconcileReply(device="a", t=UNIX_S, samples=360_000).encode_report(result, 3, "/reports/a", 20))
     assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
     assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
         "explained", {"gz": {"steps": []}}, 3, "/reports/a"
