@@ -35,7 +35,7 @@ from monitor.reconcile.result import (
     ParameterInterval,
 )
 from monitor.reconcile.summary.ranked_findings import RankedGapCause
-from monitor.reconcile.summary.summary_sentences import join_words
+from monitor.reconcile.summary.summary_sentences import describe_finding, join_words
 
 RESULT_TEXTS: Final = {
     "agrees": "agrees",
@@ -261,6 +261,25 @@ def describe_step(
     """
     said = [f"{readable_name(one.name)} {one.short}" for one in format_parameters(step, axis, baseline, units)]
     return f"{readable_name(step.effect)}: {', '.join(said)}" if said else readable_name(step.effect)
+
+
+def describe_finding_and_parameters(finding: RankedGapCause, units: UnitSystem = DEFAULT_UNITS) -> str:
+    """Describe a finding with all parameters of the axis with the largest gain, in one line.
+
+    Parameters
+    ----------
+    finding
+        Finding of the recording.
+    units
+        Unit system.
+    """
+    said = f"{'added ' if finding.kind == 'added' else ''}{describe_finding(finding)}"
+    axis, texts = finding.strongest_axis, []
+    for name, bounds in finding.parameters.items():
+        unit = parameter_unit(finding.effect, name, axis, bounds.value, units)
+        texts.append(f"{readable_name(name)} {_format_parameter(finding.effect, name, bounds, unit, None).short}")
+    where = f" ({axis})" if len(finding.axes) > 1 else ""
+    return f"{said}: {', '.join(texts)}{where}" if texts else said
 
 
 def describe_allan_influence(finding: RankedGapCause) -> str:

@@ -1,8 +1,8 @@
 """Result of a reconciliation as text for the terminal.
 
-The text begins with the summary. The option ``details`` adds the findings, the axes with their steps, and the
-unexplained differences. Each result has a symbol and a word in addition to the colour. The comparison of several
-recordings is a table of axes and recordings with lists of noise effects.
+The text consists of the summary and of one line for each finding. The option ``details`` adds the confidences, the axes
+with their steps, and the unexplained differences. Each result has a symbol and a word in addition to the colour. The
+comparison of several recordings is a table of axes and recordings with lists of noise effects.
 """
 
 from typing import Final
@@ -39,7 +39,7 @@ RESULT_STYLES: Final = {
 def print_reconciliation(
     r: Reconciliation, console: Console, *, details: bool = False, units: UnitSystem = DEFAULT_UNITS
 ) -> None:
-    """Print the summary of a reconciliation.
+    """Print the summary and the findings of a reconciliation.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def print_reconciliation(
     console
         Console that receives the output.
     details
-        If True, the findings, the axes and all steps are listed too.
+        If True, the axes and all steps are listed too.
     units
         Unit system.
     """
@@ -59,6 +59,10 @@ def print_reconciliation(
     if details:
         console.print(_findings_table(r))
         console.print(_axes_table(r, units))
+    else:
+        for one in rank_findings(r).findings:
+            said = f"{format_share(one.share):>8}  {words.describe_finding_and_parameters(one, units)}"
+            print_line(said, console)
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     print_notes(r.notes, console)
 

@@ -48,7 +48,8 @@ class RankedGapCause:
     kind: StepKind
     effect: str
     axes: tuple[str, ...]
-    parameters: dict[str, ParameterInterval]  # of the axis with the largest gain
+    strongest_axis: str  # axis with the largest gain
+    parameters: dict[str, ParameterInterval]  # on this axis
     size_ratio: float | None  # new size relative to the size in the model, on this axis
     old_frequency: float | None  # Hz, of a line, resonance or cutoff that has moved, on this axis
     confidence: float  # of the name, on this axis
@@ -205,6 +206,7 @@ def _describe_group(group: Sequence[_AxisStep], whole_nats: float, r: Reconcilia
         kind=strongest.kind,
         effect=strongest.effect,
         axes=tuple(name for name in AXES if name in dict(group)),
+        strongest_axis=axis,
         parameters=identity | dict(strongest.parameters),
         size_ratio=_size_ratio(axis, strongest, r),
         old_frequency=_old_frequency(axis, strongest, r),
