@@ -1,14 +1,13 @@
 """Plot of the Allan deviation over time (dynamic Allan deviation), with heat maps and noise coefficients.
 
-The time axis shows the end of the sliding window. The colours of a heat map show the Allan deviation divided by its
-median over time. Cells are pale if the 95 % interval of the Allan deviation contains the median. A noise coefficient
-has a panel if it is estimated in at least 5 % of the time steps. A vertical line marks a detected change.
+The time axis shows the end of the sliding window. The colours of a heat map show how far the 95 % interval of the Allan
+deviation lies from its median over time. Cells are white if the interval contains the median. A noise coefficient has a
+panel if it is estimated in at least 5 % of the time steps. A vertical line marks a detected change.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from monitor.common.unit_formatting import COEFFICIENT_NAMES, DEFAULT_UNITS, KIN
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
 from monitor.publishing.plots import style
+from monitor.publishing.plots.change_beyond_chance import log_change_beyond_chance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,10 +28,9 @@ HEAT_MAP_INCHES: Final = 1.35
 COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
 MIN_ESTIMATED_SHARE: Final = 0.05  # a coefficient that is estimated in a smaller share of the time steps has no panel
-PALE_ALPHA: Final = 0.3
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels of changes, as a share of the width
 COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
-MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the cells inside the colour scale
+MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the changed cells inside the colour scale
 BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of confidence bands that lie inside a panel
 
 
@@ -67,18 +66,12 @@ def dynamic_figure_height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
-def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
-    """Return each Allan deviation divided by its median over time, shape [T, m, 6].
-
-    The ratio is NaN if the Allan deviation is missing or its median is zero.
-
-    >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
-    >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
-    >>> bool(np.allclose(np.median(divide_by_time_median(steady), axis=0), 1.0))
-    True
-    """
+def log_changes(dynamic: DynamicAllan) -> Floats:
+    """Return the changes of the Allan deviations beyond chance, natural logarithms, shape [T, m, 6]."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return dynamic.deviation / _median(dynamic)
+        logs = [np.log(part) for part in (dynamic.deviation, dynamic.lo, dynamic.hi)]
+    logs[0] = np.where(np.isfinite(logs[0]), logs[0], np.nan)
+    return log_change_beyond_chance(*logs)
 
 
 def draw_dynamic_panels(
@@ -108,9 +101,10 @@ def draw_dynamic_panels(
     panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
     unit, unit_s = style.select_time_unit(float(dynamic.t_s[-1]))
     edges = _time_edges(dynamic.t_s) / unit_s
-    ratio, mesh = _colour_scale_end(divide_by_time_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
-    for panel, axis in zip(panels, axes, strict=False):
-        mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
+    changes, mesh = log_changes(dynamic)[..., [AXES.index(axis) for axis in axes]], None
+    ratio = _colour_scale_end(changes)
+    for i, (panel, axis) in enumerate(zip(panels, axes, strict=False)):
+        mesh = _draw_heat_map(panel, axis, edges, _tau_edges(dynamic.tau_s), changes[..., i].T, ratio)
     for panel, letter in zip(panels[len(axes) :], letters, strict=True):
         _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / unit_s, units.coefficients[kind][letter])
     panels[0].set_xlim(edges[0], edges[-1])
@@ -155,16 +149,12 @@ def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
     return groups
 
 
-def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
-    i = AXES.index(axis)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        colour = np.log(divide_by_time_median(dynamic)[:, :, i].T)
-    median = _median(dynamic)[:, :, i]
-    usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
-    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but the type hints do not
+def _draw_heat_map(
+    panel: "Axes", axis: str, time_edges: Floats, tau_edges: Floats, changes: Floats, ratio: float
+) -> "QuadMesh":
     mesh = panel.pcolormesh(
-        edges, _tau_edges(dynamic.tau_s), colour,
-        cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), alpha=alpha, rasterized=True, linewidth=0,
+        time_edges, tau_edges, changes,
+        cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), rasterized=True, linewidth=0,
     )  # fmt: skip
     panel.set_yscale("log")
     style.style_log_axis(panel, "y", minor_grid=False)
@@ -175,14 +165,11 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
 
 
 def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
-    from matplotlib.cm import ScalarMappable
-
-    # The colour bar needs a separate mappable, because the cells of the mesh are translucent.
-    bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
+    bar = figure.colorbar(mesh, ax=panels, aspect=30, pad=0.015, fraction=0.05)
     ticks = np.log(ratio) * np.linspace(-1.0, 1.0, 5)
     bar.set_ticks(ticks.tolist(), labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
     bar.ax.tick_params(labelsize=style.SMALL_TEXT)
-    bar.set_label("deviation over its median; pale: within 95 %", fontsize=style.SMALL_TEXT)
+    bar.set_label("change of the deviation beyond chance", fontsize=style.SMALL_TEXT)
     bar.outline.set_visible(False)
 
 
@@ -219,18 +206,8 @@ def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(estimated & ~padded[:-2] & ~padded[2:])
 
 
-def _median(dynamic: DynamicAllan) -> Floats:
-    """Return the median Allan deviation over time, shape [1, m, 6], NaN if it is missing or zero."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns if an axis contains only NaN
-        median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
-    return np.asarray(np.where(median > 0.0, median, np.nan))
-
-
-def _colour_scale_end(ratios: Floats) -> float:
-    with np.errstate(invalid="ignore", divide="ignore"):
-        size = np.abs(np.log(ratios))
-    size = size[np.isfinite(size)]
+def _colour_scale_end(changes: Floats) -> float:
+    size = np.abs(changes[np.isfinite(changes) & (changes != 0.0)])
     needed = float(np.exp(np.quantile(size, MIN_CELLS_IN_SCALE))) if size.size else 1.0
     return next((ratio for ratio in COLOUR_SCALE_RATIOS if ratio >= needed), COLOUR_SCALE_RATIOS[-1])
 

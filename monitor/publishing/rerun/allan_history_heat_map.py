@@ -1,12 +1,13 @@
 """Heat maps of the Allan deviation of a device over time, under ``/<device>/dynamic/<axis>`` in the viewer.
 
 The history has a table of limited size. Each column contains the mean logarithm of the Allan deviations of all
-estimates in a time interval. When the table has COLUMNS columns, neighbouring columns are averaged in pairs, and later
-columns cover twice the time. The table therefore covers the whole history with constant memory.
+estimates in a time interval, and of the ends of their 95 % intervals. When the table has COLUMNS columns, neighbouring
+columns are averaged in pairs, and later columns cover twice the time. The table therefore covers the whole history with
+constant memory.
 
-In a heat map, time increases to the right, and the averaging time τ increases upwards. The colour shows the Allan
-deviation divided by its median over time. Each heat map is a PNG image with a palette. Rerun draws no axes on an image,
-so labels are drawn as points with text. Importing this module imports Rerun.
+In a heat map, time increases to the right, and the averaging time τ increases upwards. The colour shows how far the
+95 % interval of the Allan deviation lies from its median over time. Each heat map is a PNG image with a palette. Rerun
+draws no axes on an image, so labels are drawn as points with text. Importing this module imports Rerun.
 """
 
 import io
@@ -21,6 +22,7 @@ from drivers.data_types import AXES, Floats, Ints
 from monitor.common.unit_formatting import format_utc
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
+from monitor.publishing.plots.change_beyond_chance import log_change_beyond_chance
 from monitor.publishing.rerun.allan_drawing import Log, label_points
 
 COLUMNS = 300
@@ -44,12 +46,12 @@ class AllanHistory:
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
         self.ends_s: list[float] = []  # Unix time [s] of the newest estimate in each column
-        self._columns: list[Floats] = []  # [m, 6] natural logarithm of the Allan deviation
+        self._columns: list[Floats] = []  # [3, m, 6] natural logarithms of the Allan deviation, lo and hi
         self._begin_column(wall_s)
 
     def _begin_column(self, wall_s: float) -> None:
         self._since_s = self._newest_s = wall_s
-        self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
+        self._sums: Floats = np.zeros((3, self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
     def add_estimate_and_check_column_complete(self, wall_s: float, estimate: Estimate) -> bool:
@@ -65,9 +67,10 @@ class AllanHistory:
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
         # Recent Allan deviations use only the newest samples, so that a change of the noise appears without delay.
-        avar = (estimate.display_curve or estimate.curve).avar
-        there = np.isfinite(avar) & (avar > 0.0)
-        self._sums[there] += 0.5 * np.log(avar[there])
+        curve = estimate.display_curve or estimate.curve
+        there = np.isfinite(curve.avar) & (curve.avar > 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self._sums[:, there] += np.log([np.sqrt(curve.avar[there]), curve.lo[there], curve.hi[there]])
         self._counts += there
         self._newest_s = wall_s
         if wall_s - self._since_s < self.column_s:
@@ -80,23 +83,20 @@ class AllanHistory:
         return True
 
     def _merge_pairs(self) -> None:
-        pairs = np.stack(self._columns).reshape(COLUMNS // 2, 2, self.tau_s.size, len(AXES))
+        pairs = np.stack(self._columns).reshape(COLUMNS // 2, 2, *self._sums.shape)
         there = np.isfinite(pairs)
         means = np.where(there, pairs, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
         self._columns = list(np.where(there.any(axis=1), means, np.nan))
         self.ends_s = self.ends_s[1::2]
         self.column_s *= 2.0
 
-    def log_ratio_to_median(self) -> Floats:
-        """Return the logarithm of each Allan deviation divided by its median over time, shape [columns, m, 6].
+    def log_changes(self) -> Floats:
+        """Return the changes of the Allan deviations beyond chance, natural logarithms, shape [columns, m, 6].
 
         The values are NaN where Allan deviations are missing.
         """
-        whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
-        there = np.isfinite(whole).any(axis=0)
-        median = np.full(there.shape, np.nan)
-        median[there] = np.nanmedian(whole[:, there], axis=0)
-        return np.asarray(whole - median)
+        whole = np.stack(self._columns) if self._columns else np.empty((0, *self._sums.shape))
+        return log_change_beyond_chance(*np.moveaxis(whole, 1, 0))
 
 
 HEIGHT: Final = 65  # approximate height of a heat map [pixels]
@@ -129,7 +129,7 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
     allan_history
         Allan deviations over time.
     """
-    whole = allan_history.log_ratio_to_median()
+    whole = allan_history.log_changes()
     if len(whole) < MIN_COLUMNS:
         return
     for i, axis in enumerate(AXES):
@@ -144,7 +144,7 @@ def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
 
 
 def encode_heat_map(log_ratio: Floats) -> bytes:
-    """Encode logarithms of Allan deviations divided by their medians, shape [columns, m], as a PNG image."""
+    """Encode logarithmic changes of Allan deviations, shape [columns, m], as a PNG image."""
     share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
     shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]

@@ -188,11 +188,18 @@ def test_dynamic_curves_are_below_the_analysis(tmp_path: Path, changing_noise: D
     assert red.any()
 
 
-def test_colours_show_the_deviation_relative_to_its_median(changing_noise: DynamicAllan) -> None:
-    relative = dynamic_figure.divide_by_time_median(changing_noise)
-    assert np.nanmedian(relative, axis=0) == pytest.approx(np.ones(relative.shape[1:]))
-    assert relative[-1, 0, 0] / relative[0, 0, 0] == pytest.approx(2.0, rel=0.1)
-    assert relative[-1, 0, 5] / relative[0, 0, 5] == pytest.approx(1.0, rel=0.1)
+def test_colours_show_changes_of_the_deviation_beyond_chance(changing_noise: DynamicAllan) -> None:
+    change = np.exp(dynamic_figure.log_changes(changing_noise))
+    assert 1.5 < change[-1, 0, 0] / change[0, 0, 0] < 2.0
+    assert change[-1, 0, 5] / change[0, 0, 5] == pytest.approx(1.0, abs=0.05)
+
+
+def test_chance_at_the_longest_averaging_time_does_not_saturate_the_colours() -> None:
+    noise = np.random.default_rng(1).standard_normal((6000, 6))
+    steady = compute_dynamic_allan(noise, 10.0, 60.0, step_s=9.0)
+    by_chance = np.log(steady.deviation / np.nanmedian(steady.deviation, axis=0))
+    assert np.abs(by_chance[:, -1]).max() > np.log(2.0)
+    assert np.abs(dynamic_figure.log_changes(steady)).max() < np.log(1.25)
 
 
 def test_only_coefficients_estimated_for_long_have_a_panel(changing_noise: DynamicAllan) -> None:
