@@ -129,12 +129,20 @@ def test_no_figure_repeats_another(name: str, monkeypatch: pytest.MonkeyPatch) -
     assert len({id(view) for view in drawn}) == len(drawn)
 
 
-def test_every_significant_diagnostic_is_drawn_after_the_search() -> None:
+def test_every_significant_diagnostic_is_drawn_after_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[str, str]] = []
+
+    def draw(panels: Sequence[tuple[str, DiagnosticPlotData]], *_: object, **__: object) -> str:
+        drawn.extend((title, view.diagnostic) for title, view in panels)
+        return ""
+
+    monkeypatch.setattr(reconcile_page, "diagnostic_comparison_svg", draw)
+    render_page(samples.explained())
     gz = samples.explained().axes["gz"]
-    significant = {gap.diagnostic for gap in gz.start.gaps if gap.is_significant} - {"allan"}
-    drawn = [view for view in gz.end.plots if view.diagnostic in significant]
-    assert drawn
-    assert render_example("explained").count(">after</text>") == len(drawn)
+    significant = {gap.diagnostic for gap in gz.start.gaps if gap.is_significant}
+    assert significant
+    assert {name for title, name in drawn if title == "after"} == significant
+    assert [title for title, _ in drawn[:6]] == ["before", "after"] * 3  # beside each other, in the same size
 
 
 def test_agreeing_axes_have_one_figure_each() -> None:
@@ -277,3 +285,10 @@ def test_agreeing_recordings_give_a_short_page() -> None:
     assert "2 recordings were compared with the model. None differs by more than chance." in words
     assert "No effect was found in every recording." in words
     assert "No effect was found in some recordings only." in words
+
+
+def test_page_contains_no_control_characters():
+    page = render_page(samples.explained(), "run\x1b[2J\x07\u202ecsv")
+    assert "run [2J  csv" in page
+    assert not {one for one in page if one < " "} - {"\n"}
+    assert "\u202e" not in page
