@@ -197,7 +197,8 @@ def fit_five_terms(run: RecordingContext) -> NoiseModel:
 
 def _fit_terms(axis: Axis) -> Effects:
     best = axis.fit([with_effect_size(effect, axis.cosine_transform_rms) for effect in UNIT_SOURCES[:4]])
-    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.cosine_transform_rms)))
+    ramp = RateRamp(R=axis.cosine_transform_rms)
+    with_ramp = axis.evaluate_candidate(ramp.name, lambda: axis.fit((*best.effects, ramp)), best)
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
         best = with_ramp
     for at in range(len(best.effects) - 1, -1, -1):

@@ -85,6 +85,7 @@ RANGE_FORMATS: Final = {
 }
 """Prefix and unit for each kind of range."""
 MIN_RANGE_SHARE: Final = 1e-3  # a relatively narrower range is written as one number
+MAX_DIGITS: Final = 9  # largest number of digits of a value with a very narrow interval
 SYMMETRY_TOLERANCE: Final = 0.1  # largest relative difference of the interval sides that are written as ±
 
 
@@ -380,7 +381,7 @@ def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:
         return tuple(f"{one:.{decimals}f}".replace("-", "−") for one in (value, lo, hi, half))
-    digits = max(3, 2 + floor(log10(max(abs(value), half) / half)))
+    digits = min(max(3, 2 + floor(log10(max(abs(value), half) / half))), MAX_DIGITS)
     ends = (format_number(one, digits).replace("-", "−") for one in (value, lo, hi))
     return (*ends, format_number(half, 2))
 

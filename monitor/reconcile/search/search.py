@@ -147,8 +147,12 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
     )
     kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
+        withdraw = partial(_with_other_added_effects, current.hypothesis, kept)
+        simpler = current.hypothesis.axis.evaluate_candidate("withdrawal", withdraw, None)
+        if simpler is None:
+            break
         before_withdrawal = before_withdrawal or current.findings_and_plots()
-        current = _diagnose(current.hypothesis.refit_with_other_added_effects(kept))
+        current = simpler
         kept = _without_zero_sizes(current.hypothesis.added)
     for one in rounds:
         if one.hypothesis.axis is not current.hypothesis.axis:
@@ -159,6 +163,10 @@ def search_missing_effects(axis: Axis, model: Effects, null: AxisNull, rng: np.r
 def _diagnose(hypothesis: Hypothesis, whitened: WhitenedAxis | None = None) -> _DiagnosedHypothesis:
     whitened = whitened or whiten_axis(hypothesis.fit)
     return _DiagnosedHypothesis(hypothesis, whitened, run_diagnostics(whitened))
+
+
+def _with_other_added_effects(hypothesis: Hypothesis, added: Effects) -> _DiagnosedHypothesis:
+    return _diagnose(hypothesis.refit_with_other_added_effects(added))
 
 
 def _next_round(

@@ -414,7 +414,7 @@ def _call_for_axis(
         one
         for function in functions
         for one in whitened.axis.evaluate_candidate(
-            function.__name__.removeprefix("propose_").strip("_"), partial(function, whitened), []
+            function.__name__.removeprefix("propose_").strip("_"), partial(function, whitened), list[Proposed]()
         )
     ]
 
@@ -425,14 +425,14 @@ def _noise_trial_of_each(hypothesis: Hypothesis, effects: Sequence[Effect]) -> l
         trial
         for effect in effects
         for trial in hypothesis.axis.evaluate_candidate(
-            effect.name, lambda effect=effect: [_noise_trial(hypothesis, effect)], list[Trial]()
+            effect.name, partial(_noise_trial, hypothesis, effect), list[Trial]()
         )
     ]
 
 
-def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
+def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> list[Trial]:
     score = hypothesis.refit_with_other_added_effects((*hypothesis.added, effect)).penalised_log_likelihood
-    return Trial(effect.name, effect, score - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name])
+    return [Trial(effect.name, effect, score - hypothesis.penalised_log_likelihood - PENALTY_NATS[effect.name])]
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
@@ -541,7 +541,7 @@ def _low_pass_trials_beside_known_filter(hypothesis: Hypothesis) -> list[Trial]:
     gain = changed.penalised_log_likelihood - hypothesis.penalised_log_likelihood
     found = [Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], moved=at, replaced=known)]
     second = fit_low_pass(hypothesis.axis, hypothesis.effects)
-    return found if second is None else [*found, _noise_trial(hypothesis, second)]
+    return found if second is None else [*found, *_noise_trial(hypothesis, second)]
 
 
 def _prefer_single_size(trials: list[Trial]) -> list[Trial]:
