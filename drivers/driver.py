@@ -63,6 +63,11 @@ class AxisMap:
         values = samples.values[:, self.source] * np.array(self.sign)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
+    def is_reflection(self, columns: slice) -> bool:
+        """Return True if the map of three columns is a reflection, which turning a sensor cannot cause."""
+        matrix = np.eye(6)[list(self.source)] * np.array(self.sign)[:, None]
+        return bool(np.linalg.det(matrix[columns, columns]) < 0.0)
+
 
 @dataclass(slots=True)
 class SampleCounts:
@@ -330,12 +335,12 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Parameters
     ----------
     table
-        Mapping from each output axis to a sensor axis with an optional sign.
+        Mapping from each output axis to a sensor axis with an optional sign. Absent axes remain unchanged.
 
     Raises
     ------
     ConfigError
-        If an axis is unknown, or if gyroscope and accelerometer axes are mixed.
+        If an axis is unknown, if gyroscope and accelerometer axes are mixed, or if a sensor axis is used twice.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []
@@ -349,6 +354,13 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
             continue
         source[AXES.index(axis)] = AXES.index(bare)
         sign[AXES.index(axis)] = -1.0 if word.startswith("-") else 1.0
+    for column in () if wrong else sorted({column for column in source if source.count(column) > 1}):
+        users = [axis for axis, used in zip(AXES, source, strict=True) if used == column]
+        stated = " and ".join(
+            f'{axis} = "{table[axis]}"' if axis in table else f'{axis} = "{axis}" (default)' for axis in users
+        )
+        unused = " and ".join(axis for i, axis in enumerate(AXES) if i not in source and axis[0] == AXES[column][0])
+        wrong.append(f"{stated} use the same axis of the sensor, and {unused} is lost; use each axis once")
     if wrong:
         raise ConfigError(*wrong)
     return AxisMap(tuple(source), tuple(sign))

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -145,7 +145,7 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
         hint = "" if path.suffix in ("", ".toml") else "; imu-monitor analyze reads recordings"
         return ConfigReading(None, [f"{path}: {error}{hint}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
-    warnings = [*_check_zenoh_file(checked), *_check_token_file(checked)]
+    warnings = [*_check_zenoh_file(checked), *_check_token_file(checked), *_find_reflections(checked)]
     wrong = [_format_problem(problem, table) for problem in checked.problems]
     if line := file_permissions.explain_untrusted_file(path):
         wrong.append(line)
@@ -247,6 +247,15 @@ def _check_token_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
         return []
     line = file_permissions.describe_exposed_secret(path, is_secret=True)
     return [f"influx.token_file: {path.name}: {line}"] if line else []
+
+
+def _find_reflections(checked: TableCheckResult[ConfigFile]) -> Iterator[str]:
+    """Yield a warning for each sensor whose axes are mirrored, which is right only for a sensor with such axes."""
+    for device in checked.value.devices if checked.value else ():
+        for kind, columns in (("gyroscopes", slice(3)), ("accelerometers", slice(3, 6))):
+            if device.axes.is_reflection(columns):
+                text = "no mounting does this; correct only if the sensor itself inverts axes or has left-handed axes"
+                yield f"device {device.name}: axes: the {kind} are mirrored; {text}"
 
 
 def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:

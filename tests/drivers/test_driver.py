@@ -3,6 +3,7 @@
 Most of them use the in-memory loopback link.
 """
 
+import itertools
 import os
 import threading
 import time
@@ -433,6 +434,24 @@ def test_axis_map_changes_nothing_else():
 def test_unknown_axes_are_refused(table):
     with pytest.raises(ConfigError, match="expected two axes of the same kind out of gx gy gz ax ay az"):
         parse_axis_map(table)
+
+
+def test_every_axis_map_is_a_signed_permutation_or_names_the_key_and_the_lost_axis():
+    axes = ("gx", "gy", "gz")
+    for words in itertools.product(axes, repeat=3):
+        for signs in itertools.product(("", "-"), repeat=3):
+            for omitted in ((), ("gx",), ("gy", "gz")):
+                table = {axis: sign + word for axis, sign, word in zip(axes, signs, words, strict=True)}
+                used = [axis if axis in omitted else word for axis, word in zip(axes, words, strict=True)]
+                table = {axis: word for axis, word in table.items() if axis not in omitted}
+                if len(set(used)) == 3:
+                    assert sorted(parse_axis_map(table).source) == [0, 1, 2, 3, 4, 5]
+                    continue
+                with pytest.raises(ConfigError) as refusal:
+                    parse_axis_map(table)
+                (line,) = refusal.value.mistake_lines
+                assert all(f'{axis} = "{word}"' in line for axis, word in table.items() if used.count(word[-2:]) > 1)
+                assert all(axis in line.partition(", and ")[2] for axis in set(axes) - set(used))
 
 
 def test_rejected_lines_of_an_arrival_timed_device_are_counted():

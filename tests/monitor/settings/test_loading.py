@@ -264,6 +264,13 @@ INVALID_CONFIGS = {
         format_device('axes = { gx = "up" }'),
         ['device a: axes: gx = "up": expected two axes of the same kind out of gx gy gz ax ay az'],
     ),
+    "axis used twice": (
+        format_device('axes = { gx = "gy", ax = "-az" }'),
+        [
+            'device a: axes: gx = "gy" and gy = "gy" (default) use the same axis of the sensor, and gx is lost',
+            'device a: axes: ax = "-az" and az = "az" (default) use the same axis of the sensor, and ax is lost',
+        ],
+    ),
     "missing model": (
         format_device('model = "models/none.toml"'),
         ['device a: model: no model "models/none.toml"'],
@@ -328,6 +335,23 @@ def test_invalid_configuration_is_reported_with_its_key(tmp_path, case):
     assert len(lines) == len(expected)
     for line, part in zip(lines, expected, strict=True):
         assert part in line
+
+
+@pytest.mark.parametrize(
+    ("axes", "mirrored"),
+    [
+        ('gy = "gz", gz = "-gy", ax = "-ax", ay = "-ay"', []),
+        ('gx = "gy", gy = "gz", gz = "gx"', []),
+        ('gx = "-gx"', ["gyroscopes"]),
+        ('gx = "gy", gy = "gx", ax = "-ax", ay = "-ay", az = "-az"', ["gyroscopes", "accelerometers"]),
+    ],
+)
+def test_mirrored_axes_give_a_warning(tmp_path, axes, mirrored):
+    (tmp_path / "my.toml").write_text(format_device(f"axes = {{ {axes} }}"))
+    warnings = load_config(tmp_path / "my.toml").warnings
+    assert len(warnings) == len(mirrored)
+    for line, kind in zip(warnings, mirrored, strict=True):
+        assert f"device a: axes: the {kind} are mirrored" in line
 
 
 def test_recording_is_not_taken_for_a_configuration(tmp_path):
