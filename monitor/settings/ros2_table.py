@@ -53,7 +53,8 @@ class Ros2Table(SettingsModel):
     namespace: Annotated[str, ConvertedFrom(str, _namespace)] = Field(
         "/", description="namespace of the ROS 2 node and of its imu topics"
     )
-    imu: Literal["compensated", "raw", "none"] = Field(
-        "compensated",
-        description="samples on <namespace>/<device>/imu/data_raw: without gyroscope drift, as received, or none",
+    imu: Literal["raw", "compensated", "none"] = Field(
+        "raw",
+        description="samples: raw = as received, on <namespace>/<device>/imu/data_raw; compensated = without gyroscope "
+        "drift, on imu/data_compensated; or none",
     )

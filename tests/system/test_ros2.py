@@ -54,7 +54,7 @@ def list_topics(client: Any) -> set[str]:
 @pytest.mark.parametrize("imu", ["raw", "compensated"])
 def test_subscribers_receive_every_sample_and_the_diagnostics(tmp_path: Path, imu: str) -> None:
     endpoint = free_endpoint()
-    key = "3/robot1/bench_1/imu/data_raw/sensor_msgs::msg::dds_::Imu_/**"
+    key = f"3/robot1/bench_1/imu/data_{imu}/sensor_msgs::msg::dds_::Imu_/**"
     link = zenoh_link.build(read_settings(zenoh_link.Settings, {"key": key, "connect": [endpoint]}))
     decoder = ros2_imu.build(ros2_imu.Settings())
     received: list[SampleBlock] = []
@@ -74,7 +74,7 @@ def test_subscribers_receive_every_sample_and_the_diagnostics(tmp_path: Path, im
 
                 wait_for(receive)
                 assert run.service.output_states()["ros2"] == "ok"
-                assert list_topics(client) == {"/diagnostics", "/robot1/bench_1/imu/data_raw"}
+                assert list_topics(client) == {"/diagnostics", f"/robot1/bench_1/imu/data_{imu}"}
         finally:
             link.close()
     published = run.output.blocks if imu == "raw" else run.output.compensated_blocks

@@ -57,7 +57,7 @@ class Ros2Output(NewestMetrics):
         """Add a device and its topic."""
         self._frame_ids[device.name] = device.frame_id
         if self._settings.imu != "none":
-            self._imu_topics[device.name] = imu_topic(self._settings.namespace, device.name)
+            self._imu_topics[device.name] = imu_topic(self._settings.namespace, device.name, self._settings.imu)
             self._publisher.add_topic(self._imu_topics[device.name])
 
     def remove_device(self, device: str) -> None:
@@ -97,6 +97,8 @@ class Ros2Output(NewestMetrics):
     def _publish_imu(self, device: str, samples: SampleBlock, offset_ns: Ints | int) -> None:
         found = self._estimates.get(device)
         variances = UNKNOWN_VARIANCES if found is None else white_noise_variances(found.estimate)
+        if self._settings.imu == "compensated":  # their noise is not white and depends on the motion
+            variances = np.concatenate((UNKNOWN_VARIANCES[:3], variances[3:]))
         encode = partial(
             encode_imu_messages, samples.t_ns + offset_ns, samples.values, self._frame_ids[device], variances
         )
@@ -104,7 +106,7 @@ class Ros2Output(NewestMetrics):
 
 
 def white_noise_variances(estimate: Estimate) -> Floats:
-    """Return the variances of the white noise of the samples [6], in rad²/s² and m²/s⁴.
+    """Return the variances of the white noise of the received samples [6], in rad²/s² and m²/s⁴.
 
     The Allan variance of white noise at the sample period T is its variance, N² / T (IEEE Std 952, angle random walk).
     The variances of a sensor are 0, which means unknown in ROS, until N is estimated on its three axes. Otherwise, a

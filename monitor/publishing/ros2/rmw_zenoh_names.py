@@ -5,7 +5,7 @@ name.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 from monitor.settings.ros2_table import ros_name
 
@@ -49,10 +49,11 @@ class RosTopic:
 DIAGNOSTICS: Final = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY)
 
 
-def imu_topic(namespace: str, device: str) -> RosTopic:
+def imu_topic(namespace: str, device: str, kind: Literal["raw", "compensated"]) -> RosTopic:
     """Return the topic of the samples of a device.
 
-    REP 145 reserves ``imu/data`` for messages with an orientation, which the messages of this program do not contain.
+    REP 145 defines ``imu/data_raw`` for samples as received. It reserves ``imu/data`` for messages with an orientation,
+    which the messages of this program do not contain.
 
     Parameters
     ----------
@@ -60,8 +61,10 @@ def imu_topic(namespace: str, device: str) -> RosTopic:
         Namespace of the node, such as "/robot1", or "/".
     device
         Name of the device.
+    kind
+        Samples as received, or without gyroscope drift.
     """
-    return RosTopic(f"{namespace.rstrip('/')}/{ros_name(device)}/imu/data_raw", IMU)
+    return RosTopic(f"{namespace.rstrip('/')}/{ros_name(device)}/imu/data_{kind}", IMU)
 
 
 def node_token(domain: int, session_id: str, namespace: str) -> str:

@@ -64,6 +64,6 @@ def test_names_that_are_equal_in_ros_are_refused(tmp_path: Path) -> None:
 
 
 def test_compensated_samples_need_the_compensation(tmp_path: Path) -> None:
-    [line] = examine_one_device(tmp_path, ROS2, "compensate = false").wrong
+    [line] = examine_one_device(tmp_path, f'{ROS2}imu = "compensated"\n', "compensate = false").wrong
     assert 'device bench-1: compensate: false, but ros2.imu is "compensated"' in line
-    assert examine_one_device(tmp_path, f'{ROS2}imu = "raw"\n', "compensate = false").wrong == []
+    assert examine_one_device(tmp_path, ROS2, "compensate = false").wrong == []

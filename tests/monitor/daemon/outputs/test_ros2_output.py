@@ -1,9 +1,9 @@
 """Tests of the output to ROS 2: topics, messages and reload, through a router on loopback and an independent codec."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,8 +11,9 @@ import zenoh
 
 from drivers.data_types import AXES, Event, make_block
 from monitor.daemon.outputs.ros2_output import Ros2Output, white_noise_variances
+from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS
-from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, imu_topic
+from monitor.publishing.ros2.rmw_zenoh_names import DIAGNOSTICS, RosTopic, imu_topic
 from monitor.settings.loading import Device, Ros2Table
 from tests.monitor.publishing.example_results import make_estimate, make_health
 from tests.support.ports import free_endpoint
@@ -21,6 +22,7 @@ from tests.support.settings import read_settings
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import open_router, open_session
 
+Kind = Literal["raw", "compensated"]
 STAMP_NS = 1_700_000_000_123_456_789
 ESTIMATE = make_estimate()
 VALUES = np.arange(1.0, 7.0)
@@ -72,22 +74,62 @@ def receive_by_topic(output: Ros2Output, client: Any, count: int, *devices: str)
 
 
 @pytest.mark.parametrize(("imu", "expected"), [("raw", VALUES), ("compensated", VALUES - 1.0)])
-def test_samples_have_the_frame_time_values_and_variances_of_their_device(imu: str, expected: np.ndarray) -> None:
+def test_samples_have_the_frame_time_values_and_variances_of_their_device(imu: Kind, expected: np.ndarray) -> None:
     devices = make_device("front-1", "front_link"), make_device("rear", "imu_link")
     with start_output(imu, *devices) as (output, client):
         output.publish_result("rear", 1.0, 1, ESTIMATE)
         got = receive_by_topic(output, client, 3, "front-1", "rear")
-    names = {imu_topic("/", "front-1").zenoh_key(0), imu_topic("/", "rear").zenoh_key(0), DIAGNOSTICS.zenoh_key(0)}
+    names = {
+        imu_topic("/", "front-1", imu).zenoh_key(0),
+        imu_topic("/", "rear", imu).zenoh_key(0),
+        DIAGNOSTICS.zenoh_key(0),
+    }
     assert set(got) == names
-    front, rear = (decode(got[imu_topic("/", one.name).zenoh_key(0)], IMU) for one in devices)
+    front, rear = (decode(got[imu_topic("/", one.name, imu).zenoh_key(0)], IMU) for one in devices)
     assert (front.header.frame_id, rear.header.frame_id) == ("front_link", "imu_link")
     assert stamp_ns(front) == stamp_ns(rear) == STAMP_NS
     vectors = front.angular_velocity, front.linear_acceleration
     assert [getattr(vector, axis) for vector in vectors for axis in "xyz"] == expected.tolist()
     assert not front.angular_velocity_covariance.any()
     variances = white_noise_variances(ESTIMATE)
+    if imu == "compensated":
+        variances[:3] = 0.0
     assert rear.angular_velocity_covariance.tolist() == np.diag(variances[:3]).ravel().tolist()
     assert rear.linear_acceleration_covariance.tolist() == np.diag(variances[3:]).ravel().tolist()
+
+
+def test_covariance_belongs_to_the_samples_that_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    n = ESTIMATE.coefficients.value[SYMBOLS.index("N")]
+    noise = np.random.default_rng(2).normal(size=(12_000, 6)) * n * np.sqrt(ESTIMATE.rate_hz)
+    compensation = LiveDriftCompensation(ESTIMATE.rate_hz)
+    sent: dict[str, list[Any]] = {}
+    tables: list[dict[str, Any]] = [{"domain": 0}, {"domain": 0, "imu": "compensated"}]
+    outputs = [Ros2Output(read_settings(Ros2Table, table), [make_device("a", "imu_link")]) for table in tables]
+
+    def decode_messages(topic: RosTopic, count: int, encode: Callable[[], Sequence[bytes]]) -> None:
+        sent.setdefault(topic.name, []).extend(decode(message, IMU) for message in encode())
+
+    for output in outputs:
+        monkeypatch.setattr(output._publisher, "publish", decode_messages)
+        output.publish_result("a", 1.0, 1, ESTIMATE)
+    for start in range(0, len(noise), 100):
+        t_ns = np.arange(start, start + 100) * round(1e9 / ESTIMATE.rate_hz)
+        block = make_block(t_ns, noise[start : start + 100])
+        compensated = compensation.compensate_block(block)
+        for output in outputs:
+            output.publish_samples("a", start + 100, block, STAMP_NS)
+            output.publish_drift_compensated_samples("a", start + 100, compensated, STAMP_NS)
+    assert set(sent) == {"/a/imu/data_raw", "/a/imu/data_compensated"}
+    for name, messages in sent.items():
+        for quantity in ("angular_velocity", "linear_acceleration"):
+            vectors = [getattr(one, quantity) for one in messages[len(messages) // 2 :]]
+            variances = np.var([[one.x, one.y, one.z] for one in vectors], axis=0)
+            stated = getattr(messages[-1], f"{quantity}_covariance").reshape(3, 3)
+            if (name, quantity) == ("/a/imu/data_compensated", "angular_velocity"):
+                assert (variances < 0.1 * white_noise_variances(ESTIMATE)[:3]).all()
+                assert not stated.any()
+            else:
+                np.testing.assert_allclose(np.diag(stated), variances, rtol=0.1)
 
 
 def test_diagnostics_have_one_status_per_device() -> None:
@@ -113,7 +155,7 @@ def test_diagnostics_have_one_status_per_device() -> None:
 def test_added_device_has_a_topic_until_it_is_removed() -> None:
     with start_output("raw") as (output, client):
         output.add_device(make_device("a", "imu_link"))
-        assert imu_topic("/", "a").zenoh_key(0) in receive_by_topic(output, client, 2, "a")
+        assert imu_topic("/", "a", "raw").zenoh_key(0) in receive_by_topic(output, client, 2, "a")
         output.remove_device("a")
         assert output._publisher._topics == {DIAGNOSTICS}
 

@@ -63,7 +63,7 @@ def test_type_hashes_are_those_of_the_release(store: object) -> None:
     ("namespace", "name"), [("/", "/bench_1/imu/data_raw"), ("/robot1/arm", "/robot1/arm/bench_1/imu/data_raw")]
 )
 def test_topic_and_key_of_the_samples(namespace: str, name: str) -> None:
-    topic = imu_topic(namespace, "bench-1")
+    topic = imu_topic(namespace, "bench-1", "raw")
     assert topic.name == name
     assert topic.zenoh_key(7) == f"7{name}/sensor_msgs::msg::dds_::Imu_/{rmw_zenoh_names.IMU.type_hash}"
 
@@ -74,7 +74,7 @@ def test_node_token(namespace: str) -> None:
     assert found == Token(7, SESSION, 0, 0, "NN", "/", namespace, "imu_monitor", ())
 
 
-@pytest.mark.parametrize("topic", [DIAGNOSTICS, imu_topic("/robot1", "front")])
+@pytest.mark.parametrize("topic", [DIAGNOSTICS, imu_topic("/robot1", "front", "compensated")])
 def test_publisher_token(topic: RosTopic) -> None:
     found = parse_token(publisher_token(7, SESSION, "/robot1", 3, topic))
     qos = found.endpoint[-1]

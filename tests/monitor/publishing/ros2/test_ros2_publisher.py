@@ -18,7 +18,7 @@ from tests.support.zenoh_sessions import open_router, open_session
 
 DOMAIN = 7
 NAMESPACE = "/robot1"
-SAMPLES = imu_topic(NAMESPACE, "bench-1")
+SAMPLES = imu_topic(NAMESPACE, "bench-1", "raw")
 
 
 @pytest.fixture
