@@ -18,23 +18,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from drivers.secret_masking import mask_secrets
+
 MAX_TEXT_CHARACTERS: Final = 2000
 """Maximum length of an error text in characters. The limit is needed because an error may quote received data."""
 
 
 class ImuError(Exception):
-    """Base class of all exceptions of the project. The error text is a single line without control characters."""
+    """Base class of all exceptions. The error text is a single line without control characters and secrets."""
 
     def __str__(self) -> str:
         return make_printable_and_shorten(super().__str__())
 
 
 def make_printable_and_shorten(text: str) -> str:
-    """Replace control characters with spaces, and shorten the text to MAX_TEXT_CHARACTERS characters.
+    """Replace control characters with spaces, mask secrets, and shorten the text to MAX_TEXT_CHARACTERS characters.
 
     >>> make_printable_and_shorten("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
+    text = mask_secrets(text[: 2 * MAX_TEXT_CHARACTERS])  # before a secret is cut
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
     return text if len(text) <= MAX_TEXT_CHARACTERS else f"{text[:MAX_TEXT_CHARACTERS]} …"
 

@@ -17,6 +17,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ.get("OPENBLAS_NUM_THREADS", "1")
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH"))))
 
 import imu_monitor  # noqa: F401 - binds the packages of the project
+from drivers import secret_masking
 from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
 from tests.support.waiting import PATIENCE_S
@@ -95,6 +96,12 @@ def pytest_collect_file(file_path: Path) -> Generator[None, list[pytest.Collecto
 def pytest_unconfigure() -> None:
     """Release the ports that this process has claimed."""
     release_claims()
+
+
+@pytest.fixture(autouse=True)
+def _forget_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a test remember secrets that do not affect the texts of other tests."""
+    monkeypatch.setattr(secret_masking, "_fragments", {length: set() for length in secret_masking._fragments})
 
 
 @pytest.fixture(autouse=True)

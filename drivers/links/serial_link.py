@@ -27,10 +27,10 @@ from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_erro
 from drivers.host.wake_signal import WakeSignal
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.links.periodic_request import PeriodicRequest, parse_request
+from drivers.secret_masking import mask_secrets
 from drivers.validation.module_lookup import format_choices_by_similarity
 from drivers.validation.number_ranges import BIT_RATE, READ_TIMEOUT_S, REQUEST_RATE_HZ
 from drivers.validation.settings_model import checked_by
-from drivers.zenoh.credential_masking import mask_secrets
 
 if TYPE_CHECKING:
     import serial

@@ -25,9 +25,9 @@ from pydantic import Field
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.secret_masking import mask_secrets
 from drivers.validation.settings_model import FilePath, ListOf
 from drivers.zenoh.connection_diagnosis import explain_refusals
-from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,

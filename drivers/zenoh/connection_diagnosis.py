@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import describe_error
-from drivers.zenoh.credential_masking import mask_secrets
+from drivers.secret_masking import mask_secrets
 
 if TYPE_CHECKING:
     import zenoh

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.host.safe_file_reading import check_regular_file
-from drivers.zenoh.credential_masking import mask_secrets
+from drivers.secret_masking import mask_secrets, remember_secrets_in
 
 if TYPE_CHECKING:
     import zenoh
@@ -83,6 +83,7 @@ def build_session_config(
     for key, value in overrides.items():
         if value is not None:
             config.insert_json5(key, json.dumps(value))
+    remember_secrets_in(str(config))
     return config
 
 

@@ -17,6 +17,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from drivers.secret_masking import remember_secrets_of_process
 from monitor.cli import (
     analyze,
     check,
@@ -129,6 +130,7 @@ def main() -> None:
     Every error is printed as one line on standard error. The option ``--debug`` adds the traceback and debug messages,
     and may precede or follow the name of the command.
     """
+    remember_secrets_of_process(os.environ, sys.argv)
     arguments, debug = _split_debug(sys.argv[1:])
     if debug:
         logging.basicConfig(format="imu-monitor: %(message)s")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from drivers.errors import ConfigError
-from drivers.zenoh.credential_masking import mask_secrets
+from drivers.secret_masking import mask_secrets
 from monitor.cli.shared import options, output
 from monitor.cli.shared.errors import name_option_in_config_errors
 

@@ -17,6 +17,7 @@ import structlog
 from drivers.data_types import SenderTimedFormat
 from drivers.errors import ConfigError
 from drivers.host.wake_signal import WakeSignal
+from drivers.secret_masking import mask_secrets
 from monitor.common.device_health import Health, format_service_status
 from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.daemon.config_changes import ConfigChange
@@ -150,7 +151,7 @@ class DaemonProcess:
             "hook": self.hooks if self.hooks.hooks else None,
             **self._writers,
         }
-        return {name: output.state for name, output in outputs.items() if output is not None}
+        return {name: mask_secrets(output.state) for name, output in outputs.items() if output is not None}
 
     # --- defined by the subclasses
 

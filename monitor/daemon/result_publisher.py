@@ -13,6 +13,7 @@ import numpy as np
 from drivers.data_types import Event, SampleBlock, merge_contiguous_blocks
 from drivers.driver import Driver
 from drivers.errors import NotReady
+from drivers.secret_masking import mask_secrets
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.operations.coefficient_limits import LimitMonitor
@@ -79,8 +80,9 @@ class ResultPublisher:
         """Publish events to all outputs."""
         for event in events:
             unix_s = self.timeline.to_unix_s(event.t_ns)
+            masked = replace(event, text=mask_secrets(event.text))
             for output in self.outputs:
-                output.publish_event(self.device.name, unix_s, self._received, event)
+                output.publish_event(self.device.name, unix_s, self._received, masked)
 
     def batch_samples_and_publish_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
         """Add samples to the batch, and publish the batch if it is due; return True if it was published."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.host.safe_file_reading import open_regular_file, real_path
-from drivers.zenoh.credential_masking import has_secret
+from drivers.secret_masking import has_secret
 
 MAX_SECRET_FILE_BYTES: Final = 1_000_000
 """Number of bytes at the start of a file that are searched for a secret."""

@@ -1,6 +1,7 @@
 """Read configuration files, and report all mistakes of a file together."""
 
 import dataclasses
+import json
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
@@ -10,6 +11,7 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.host import safe_file_reading
+from drivers.secret_masking import remember_secrets_in
 from drivers.validation.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
@@ -131,7 +133,9 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
         True to accept a pipe instead of a regular file.
     """
     try:
-        table = toml_parser.parse_toml(safe_file_reading.read_small_file(path, allow_pipe=allow_pipe).decode("utf-8"))
+        text = safe_file_reading.read_small_file(path, allow_pipe=allow_pipe).decode("utf-8")
+        remember_secrets_in(text)
+        table = toml_parser.parse_toml(text)
     except FileNotFoundError:
         return ConfigReading(
             None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"]
@@ -190,6 +194,7 @@ def load_selected_devices(table: Mapping[str, Any], folder: Path) -> Config:
     ConfigError
         If the configuration is no longer valid, for example because a file has been deleted.
     """
+    remember_secrets_in(json.dumps(table))
     checked = check_table(ConfigFile, table, folder)
     if checked.problems or checked.value is None:
         raise ConfigError(*(_format_problem(problem, table) for problem in checked.problems))

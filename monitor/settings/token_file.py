@@ -4,6 +4,7 @@ from pathlib import Path
 
 from drivers.errors import ConfigError, describe_error
 from drivers.host.safe_file_reading import read_small_file
+from drivers.secret_masking import remember_secret
 
 
 def read_token(path: Path) -> str:
@@ -28,4 +29,5 @@ def read_token(path: Path) -> str:
         token = ""
     if not token or " " in token or not token.isprintable():
         raise ConfigError(f"{path}: must contain the token, as one word of ASCII characters")
+    remember_secret(token)
     return token

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
 from drivers.errors import ConfigError
-from drivers.zenoh.credential_masking import mask_secrets
+from drivers.secret_masking import mask_secrets
 from monitor.cli.shared.errors import name_option_in_config_errors
 from monitor.common.control_characters import remove_control_characters
 

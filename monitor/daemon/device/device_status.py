@@ -2,6 +2,7 @@
 
 import time
 
+from drivers.secret_masking import mask_secrets
 from monitor.common.device_health import Health
 from monitor.daemon.device.latency_meter import LatencyMeter
 from monitor.daemon.device.ring_buffer import RingBuffer
@@ -58,7 +59,7 @@ class DeviceStatus:
             latency_p99_s=high_s,
             memory_bytes=memory_bytes,
             outputs=dict(states),
-            text=self._text(),
+            text=mask_secrets(self._text()),
             uptime_s=time.monotonic() - self._started_s,
             repeated=clock.dropped_repeated_rows,
             late=clock.dropped_late_rows + driver.counts.late,

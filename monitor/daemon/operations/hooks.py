@@ -24,6 +24,7 @@ from typing import Final
 import structlog
 
 from drivers.data_types import Event
+from drivers.secret_masking import mask_secrets
 from monitor.daemon.outputs.output import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
@@ -216,7 +217,7 @@ def _wait_for_end(process: "subprocess.Popen[bytes]", output: int, timeout_s: fl
         tail = (tail + _read(output))[-OUTPUT_BYTES:]
     how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
     lines = tail.decode("utf-8", "replace").strip().splitlines()
-    last = "".join(letter if letter.isprintable() else "�" for letter in lines[-1]) if lines else ""
+    last = "".join(letter if letter.isprintable() else "�" for letter in mask_secrets(lines[-1])) if lines else ""
     return f"{how}: {last[-MAX_LINE_CHARS:]}" if last else how
 
 

@@ -10,8 +10,8 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Event, Floats
+from drivers.secret_masking import mask_secrets
 from drivers.validation.number_ranges import RATE_HZ
-from drivers.zenoh.credential_masking import mask_secrets
 from monitor.common import topics
 from monitor.common.control_characters import remove_control_characters
 from monitor.common.device_health import Health
@@ -358,7 +358,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema_n
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode an event from another process, and remove control characters from all texts.
+        """Decode an event from another process, and remove control characters and secrets from all texts.
 
         Raises
         ------
@@ -583,4 +583,4 @@ def _deviation_curves(curve: AllanCurve | VarianceCurve) -> list[DeviationCurve]
 
 
 def _clean(text: str) -> str:
-    return remove_control_characters(text[:MAX_TEXT_LENGTH])
+    return remove_control_characters(mask_secrets(text[:MAX_TEXT_LENGTH]))

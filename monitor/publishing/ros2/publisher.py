@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.secret_masking import mask_secrets
 from drivers.zenoh.connection_diagnosis import explain_refusals
-from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.rmw_attachment import GID_BYTES, encode_attachment
 from drivers.zenoh.session_config import build_session_config, format_zenoh_error, is_unconnected
 from monitor.common.unit_formatting import format_count

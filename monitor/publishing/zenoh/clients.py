@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
+from drivers.secret_masking import mask_secrets
 from drivers.zenoh.connection_diagnosis import explain_refusals
-from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
 from monitor.common.control_characters import remove_control_characters

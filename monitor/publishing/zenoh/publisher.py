@@ -24,8 +24,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError, ImuError, NotReady
+from drivers.secret_masking import mask_secrets
 from drivers.zenoh.connection_diagnosis import explain_refusals
-from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import ConfigError
+from drivers.secret_masking import mask_secrets
 from drivers.zenoh.connection_diagnosis import explain_refusal
-from drivers.zenoh.credential_masking import mask_secrets
 from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,

@@ -14,6 +14,7 @@ from structlog.testing import capture_logs
 
 from drivers.data_types import Event
 from drivers.recordings import save_samples
+from drivers.secret_masking import remember_secret
 from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_groups
 from monitor.daemon.outputs.output import Output
@@ -109,6 +110,36 @@ def test_old_recording_shows_nothing_at_the_present_time(tmp_path: Path) -> None
     assert "ENDED" in str(cells["/d/status"])
     times_s = [t / 1e9 for entity in cells.values() for t in entity.get("sample_time", []) if isinstance(t, int)]
     assert RECORDED_S <= min(times_s) <= max(times_s) <= RECORDED_S + 1.0
+
+
+class TextCollector(Output):
+    """Collects all texts of the status reports and events."""
+
+    state = "the server refuses kR7-wq2Zt9"
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        self.texts.append(event.text)
+
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
+        self.texts += [health.text, *health.outputs.values()]
+
+
+def test_secrets_in_texts_from_outside_reach_no_output(tmp_path: Path) -> None:
+    (tmp_path / "samples.csv").write_text("t,gz\n" + "".join(f"{i / 100:.2f},{0.1 * (-1) ** i}\n" for i in range(100)))
+    config = write_and_load_config(tmp_path, 'link = "replay", path = "samples.csv"', 'mode = "none"\n')
+    remember_secret("kR7-wq2Zt9")
+    collector = TextCollector()
+    service = Service(config, [collector], writers={"log": collector})
+    service.workers[0].driver.text = "the gateway refuses a1I3LXdxMlp0OQ=="
+    service.workers[0].publish_event("link_lost", "lost %6BR7-wq2Zt9")
+    service._publish_status()
+    service.run(PATIENCE_S)
+    assert {"lost ***", "the server refuses ***"} <= set(collector.texts)
+    assert any(text.startswith("the gateway refuses ***") for text in collector.texts)
+    assert not any("wq2Z" in text or "XdxM" in text for text in collector.texts)
 
 
 class TimeCollector(Output):

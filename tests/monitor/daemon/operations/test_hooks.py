@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.data_types import Event
+from drivers.secret_masking import remember_secrets_of_process
 from monitor.daemon.operations.hooks import BURST, MAX_QUEUED, RUN_INTERVAL_S, THREADS, Hooks
 from monitor.settings.loading import Hook
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -94,6 +95,18 @@ def test_failed_command_is_reported_until_one_succeeds(tmp_path: Path) -> None:
         path.unlink()
         running.raise_event()
         wait_for(lambda: running.hooks.state == "ok")
+
+
+def test_secret_in_the_output_of_a_command_is_masked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MODEM_TOKEN", "Qx7-hunter2-Lm4")
+    remember_secrets_of_process(os.environ, [])
+    long_line = "print('x' * 300, 'password:', 'x' * 190 + 'a', os.environ['MODEM_TOKEN'])\nsys.exit(3)"
+    with RunningHooks(make_hook(write_program(tmp_path, long_line))) as running:
+        running.raise_event()
+        wait_for(lambda: running.hooks.state != "ok")
+        assert "exit status 3: " in running.hooks.state
+        assert "hunter2" not in running.hooks.state
+        assert "xxxxa" not in running.hooks.state  # the name of the password is cut off
 
 
 def test_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Tests of the output to InfluxDB, with a server on loopback and an independent parser of the line protocol."""
 
+import base64
+import json
 import ssl
 import threading
 from collections.abc import Iterator, MutableMapping, Sequence
@@ -7,6 +9,7 @@ from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 import trustme
@@ -369,6 +372,34 @@ def test_request_without_an_answer_is_repeated(monkeypatch: pytest.MonkeyPatch) 
         wait_for(lambda: output.state.endswith(": timed out; trying again"))
         database.may_answer.set()
         wait_for(lambda: output.state == "ok")
+
+
+TOKEN = "zk/Pq8+tR2_vN5wX1=="
+ECHOES = {
+    "plain": TOKEN,
+    "percent": quote(TOKEN, safe=""),
+    "JSON": json.dumps({"headers": {"Authorization": f"Token {TOKEN}"}}).replace("/", r"\/"),
+    "base64": base64.b64encode(f"Token {TOKEN}".encode()).decode(),
+    "cut off": "x" * (influx_output.MAX_ANSWER_BYTES - 12) + TOKEN,
+}
+
+
+@pytest.mark.parametrize("status", [400, 401])
+@pytest.mark.parametrize("notation", ECHOES)
+def test_token_that_the_server_echoes_is_neither_in_the_state_nor_in_the_log(
+    tmp_path: Path, notation: str, status: int
+) -> None:
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    with run_database() as database, capture_logs() as log, run_output(database.url, tmp_path / "token") as output:
+        database.status, database.message = status, ECHOES[notation]
+        publish_status(output, 1)
+        wait_for(lambda: output.state != "ok")
+        texts = [output.state, *(text for _, text in log_lines(log, database.url.split("/")[2]))]
+    assert len(texts) >= 2
+    for text in texts:
+        assert f"HTTP {status}" in text
+        assert "***" in text
+        assert not any(part in text for part in (TOKEN[:10], ECHOES["percent"][:10], ECHOES["base64"][12:22]))
 
 
 # --- service
