@@ -158,6 +158,7 @@ EVENT_KINDS: Final = (
     "limit_crossed",
     "limit_back",
     "window_rebuilt",
+    "estimation_restarted",
     "recording_stopped",
     "recording_back",
 )

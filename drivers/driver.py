@@ -20,6 +20,7 @@ from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedForma
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import DropCountingLink, Link
+from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
 from drivers.wire_format_identification import identify_wire_format
 
@@ -124,6 +125,8 @@ class Driver:
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTimedFormat)
         self.first_t_ns: int | None = None
         """Time of the first sample; None until a sample arrives."""
+        self.unexpected_error: Exception | None = None
+        """Exception that shows a bug in the program. The reader of this attribute sets it to None."""
         self._push = push
         self._keep = keep
         self._axes = axes or AxisMap()
@@ -163,16 +166,24 @@ class Driver:
 
     def run(self) -> None:
         """Read from the link until the driver is stopped or a replay has ended."""
-        try:
-            self._run()
-        except Exception as error:
-            # An unexpected exception is a bug in the program. The status shows the error, and the thread ends.
-            self.state, self.text = "lost", f"the reader ended because of a bug in the program: {error!r}"
-            raise
+        while True:
+            try:
+                return self._run()
+            except Exception as error:  # noqa: BLE001 - the status of the device shows the bug
+                self.unexpected_error = error
+                text = f"the reader failed because of a bug in the program: {error!r}"
+            if isinstance(self.link, ReplayLink):  # the link would begin again with the first sample
+                self.state, self.text = "ended", text
+                return None
+            self.state, self.text = "lost", f"{text}; trying again"
+            if self._stop.wait(MAX_RETRY_PAUSE_S):
+                return None
 
     def _run(self) -> None:
         """Read until the driver is stopped or a replay ends. After a link error, reopen the link."""
         pause_s = MIN_RETRY_PAUSE_S
+        if self.state == "lost":  # after an unexpected exception
+            self._reset_stream()
         while not self._stop.is_set():
             received = self.counts.received
             self.iterations += 1
@@ -318,6 +329,10 @@ class Driver:
             self._event("link_lost", str(error))
             self.state = "lost"
         self.text = f"{error}; trying again"
+        self._reset_stream()
+
+    def _reset_stream(self) -> None:
+        """Close the link, and discard the state that depends on the bytes before."""
         self.link.close()
         self.decoder.forget_stream_state()
         self._reported_drops = self._decoder_drops()

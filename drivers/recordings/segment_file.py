@@ -36,7 +36,7 @@ from drivers.recordings.file_formats.parquet_and_arrow_format import (
 )
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
-from drivers.validation.number_ranges import COUNTER_STEP, RATE_HZ
+from drivers.validation.number_ranges import COEFFICIENT, COUNTER_STEP, RATE_HZ
 
 SUFFIX: Final = ".arrows"
 NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
@@ -85,6 +85,8 @@ class GapFreeSegmentPart:
 
     samples: SampleBlock  # t_ns are Unix times
     state: DaemonState
+    state_error: str = ""
+    """Description of the damage if the recorded state is damaged, in which case ``state`` is empty."""
 
 
 class SegmentFileWriter:
@@ -237,11 +239,13 @@ def read_metadata(path: Path) -> SegmentMetadata:
 def read_last_piece(path: Path) -> GapFreeSegmentPart | None:
     """Return the last samples of a finished segment, or None if the segment is empty.
 
-    Raise RecordingError if the file is not a segment. The file is memory-mapped, so that only the last batch is read
-    from the disk.
+    Raise RecordingError if the file is not a segment, or if the last batch contains implausible values. The file is
+    memory-mapped, so that only the last batch is read from the disk.
     """
     last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
     pieces = [piece for batch in last for piece in _split_batch(*batch)]
+    if last and not pieces:
+        raise RecordingError(f"{path}: the newest rows contain impossible times, counts or values")
     return pieces[-1] if pieces else None
 
 
@@ -261,14 +265,14 @@ def _split_batch(batch: Any, meta: Any) -> Iterator[GapFreeSegmentPart]:
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
         return
-    state = _decode_state(meta)
+    state, state_error = _decode_state(meta)
     rows = make_block(columns["t_ns"].copy(), values, columns["temperature"].copy(), columns["ticks"].copy())
     lost = columns["lost"]
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
     for a, b in pairwise(edges):
         part = rows[a:b]
         yield GapFreeSegmentPart(
-            make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state
+            make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state, state_error
         )
 
 
@@ -291,19 +295,24 @@ def _with_times_in_ns(columns: dict[str, Any]) -> dict[str, Any]:
     return {"t_ns": t_ns, **{name: column for name, column in columns.items() if name != "t"}}
 
 
-def _decode_state(meta: Any) -> DaemonState:
+def _decode_state(meta: Any) -> tuple[DaemonState, str]:
     """Decode the state of the daemon from the metadata of a batch.
 
-    Return an empty state if the metadata are invalid.
+    Return an empty state and a description of the damage if the metadata are invalid.
     """
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return DaemonState()
-    sizes = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
-    rate = found.rate is None or RATE_HZ.supports(found.rate)
-    step = found.tick_step is None or COUNTER_STEP.supports(found.tick_step)
-    return found if sizes and len(found.since) == len(AXES) and rate and step else DaemonState()
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return DaemonState(), f"the recorded state cannot be decoded ({first_message_line(error)})"
+    terms = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
+    valid = {
+        "rate": found.rate is None or RATE_HZ.supports(found.rate),
+        "since": len(found.since) == len(AXES) and all(one is None or abs(one) < T_LIMIT_S for one in found.since),
+        "tick_step": found.tick_step is None or COUNTER_STEP.supports(found.tick_step),
+        "theta": terms and all(one is None or 0.0 <= one <= COEFFICIENT.high for one in found.theta),
+    }
+    wrong = ", ".join(name for name, is_valid in valid.items() if not is_valid)
+    return (DaemonState(), f"the recorded state is damaged ({wrong})") if wrong else (found, "")
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:

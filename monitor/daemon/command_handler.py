@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import structlog
 
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.operations.reconcile_on_request import Reconciler, WindowCopyForReconcile
 from monitor.publishing.messages.results import ResetReply
@@ -31,10 +32,13 @@ class CommandHandler:
         """Execute the commands that have arrived since the last call."""
         while not self._zenoh.commands.empty():
             command = self._zenoh.commands.get_nowait()
-            if command.device in workers:
-                self._execute(command, workers[command.device])
-            else:
+            if command.device not in workers:
                 command.reply_refusal("the device was removed from the configuration")
+                continue
+            try:
+                self._execute(command, workers[command.device])
+            except Exception as error:  # noqa: BLE001 - the reply contains the error
+                command.reply_refusal(log_unexpected_error(f"command {command.verb} of {command.device}", error))
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
         """Publish an event for each reconciliation that has finished since the last call."""

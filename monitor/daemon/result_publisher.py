@@ -17,7 +17,7 @@ from drivers.secret_masking import mask_secrets
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.operations.coefficient_limits import LimitMonitor
-from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.output import Output, call_outputs
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveDriftCompensation
 from monitor.estimation.detection.comparison_with_noise_model import ModelAgreementMonitor, ModelComparison
@@ -44,6 +44,8 @@ class ResultPublisher:
         Settings of the device.
     driver : Driver
         Driver of the device.
+    timeline : DeviceTimeline
+        Timeline of the samples.
     pipeline : DevicePipeline
         Pipeline that computes the results.
     limits : LimitMonitor
@@ -56,13 +58,14 @@ class ResultPublisher:
         self,
         device: Device,
         driver: Driver,
+        timeline: DeviceTimeline,
         pipeline: DevicePipeline,
         limits: LimitMonitor,
         outputs: Sequence[Output],
     ) -> None:
         self.device = device
         self.driver = driver
-        self.timeline = DeviceTimeline(driver)
+        self.timeline = timeline
         self.pipeline = pipeline
         self.limits = limits
         self.outputs = outputs
@@ -81,8 +84,7 @@ class ResultPublisher:
         for event in events:
             unix_s = self.timeline.to_unix_s(event.t_ns)
             masked = replace(event, text=mask_secrets(event.text))
-            for output in self.outputs:
-                output.publish_event(self.device.name, unix_s, self._received, masked)
+            call_outputs(self.outputs, "publish_event", self.device.name, unix_s, self._received, masked)
 
     def batch_samples_and_publish_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
         """Add samples to the batch, and publish the batch if it is due; return True if it was published."""
@@ -95,8 +97,7 @@ class ResultPublisher:
         for samples in merge_contiguous_blocks(batch):
             self.published += len(samples)
             offsets_ns = self.timeline.unix_offsets_ns(samples)
-            for output in self.outputs:
-                output.publish_samples(self.device.name, self.published, samples, offsets_ns)
+            call_outputs(self.outputs, "publish_samples", self.device.name, self.published, samples, offsets_ns)
             if compensation is not None and np.isfinite(samples.values[:, :3]).any():
                 self._compensated(compensation, samples)
         return True
@@ -140,8 +141,7 @@ class ResultPublisher:
 
     def _result(self, t_ns: int, result: Any) -> None:
         unix_s = self.timeline.to_unix_s(t_ns)
-        for output in self.outputs:
-            output.publish_result(self.device.name, unix_s, self._received, result)
+        call_outputs(self.outputs, "publish_result", self.device.name, unix_s, self._received, result)
 
     def _compensated(self, live: LiveDriftCompensation, samples: SampleBlock) -> None:
         """Publish samples after drift compensation, and the state of the drift compensation."""
@@ -152,10 +152,14 @@ class ResultPublisher:
             compensated = live.compensate_block(piece)
             self.pipeline.adopt_and_identify_drift_models()
             offsets_ns = self.timeline.unix_offsets_ns(compensated)
-            for output in self.outputs:
-                output.publish_drift_compensated_samples(
-                    self.device.name, self.published - len(samples) + at, compensated, offsets_ns
-                )
+            call_outputs(
+                self.outputs,
+                "publish_drift_compensated_samples",
+                self.device.name,
+                self.published - len(samples) + at,
+                compensated,
+                offsets_ns,
+            )
         for drift in live.take_drift_updates():
             self._result(drift.t_ns, drift)
 

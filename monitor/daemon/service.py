@@ -23,7 +23,7 @@ from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
-from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.output import Output, call_outputs
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.settings.loading import Config, Device, Storage, VirtualTable
@@ -98,8 +98,7 @@ class Service(DaemonProcess):
     def _set_alive(self, device: str, samples_arrive: bool) -> None:
         if self._alive.get(device, False) != samples_arrive:
             self._alive[device] = samples_arrive
-            for output in self.outputs:
-                output.set_alive(device, samples_arrive)
+            call_outputs(self.outputs, "set_alive", device, samples_arrive)
 
     def _wait(self, round_start_s: float) -> None:
         self._wake.wait_and_clear(MAX_IDLE_S)
@@ -143,8 +142,7 @@ class Service(DaemonProcess):
         leaving = [worker for worker in self.workers if worker.name in change.removed]
         for worker in leaving:
             worker.stop_reader_thread()  # all readers stop in parallel
-        for worker in leaving:
-            self._remove(worker)
+        self._remove(leaving)
         for device in change.limited:
             next(worker for worker in self.workers if worker.name == device.name).replace_limits(device)
         self._adopt(change.config)
@@ -154,36 +152,40 @@ class Service(DaemonProcess):
             self._start_added(worker)
 
     def _start_added(self, worker: DeviceWorker) -> None:
-        for output in self.outputs:
-            output.add_device(worker.device)
+        call_outputs(self.outputs, "add_device", worker.device)
         if self.recorder is not None:
             self.recorder.start_recordings(_segment_origins(self.config.storage, worker.device))
         worker.start_reader_and_resume_recording()
         if self.recorder is not None:
             threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
 
-    def _remove(self, worker: DeviceWorker) -> None:
-        """Publish the remaining samples of a stopped device and remove the device, while other devices continue."""
-        if not self._work_until(lambda: worker.join_reader_thread(0.0) and not worker.restore.active):
-            _log.warning("reader did not end in time", device=worker.name)
-        worker.process_new_samples(time.monotonic(), drain=True)
-        self.workers = [one for one in self.workers if one is not worker]
-        self._alive.pop(worker.name, None)
-        if self.recorder is not None:
-            self.recorder.remove_device(worker.name)
-            self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))
-        for output in self.outputs:
-            output.remove_device(worker.name)
+    def _remove(self, leaving: Sequence[DeviceWorker]) -> None:
+        """Publish the remaining samples of stopped devices and remove the devices, while other devices continue."""
 
-    def _work_until(self, done: Callable[[], bool]) -> bool:
-        """Process all devices until ``done`` returns True or JOIN_TIMEOUT_S has passed; return the value of
-        ``done``.
-        """
+        def has_ended(worker: DeviceWorker) -> bool:
+            return worker.join_reader_thread(0.0) and not worker.restore.active
+
+        self._work_until(lambda: all(map(has_ended, leaving)))
+        recorder = self.recorder
+        for worker in leaving:
+            if not has_ended(worker):
+                _log.warning("reader did not end in time", device=worker.name)
+            worker.process_new_samples(time.monotonic(), drain=True)
+            self._alive.pop(worker.name, None)
+            if recorder is not None:
+                recorder.remove_device(worker.name)
+        self.workers = [one for one in self.workers if one not in leaving]
+        if recorder is not None:  # a device that is added again continues its recording
+            self._work_until(lambda: not any(recorder.is_recording(worker.name) for worker in leaving))
+        for worker in leaving:
+            call_outputs(self.outputs, "remove_device", worker.name)
+
+    def _work_until(self, done: Callable[[], bool]) -> None:
+        """Process all devices until ``done`` returns True, JOIN_TIMEOUT_S has passed or the service must stop."""
         until_s = time.monotonic() + JOIN_TIMEOUT_S
-        while not (ended := done()) and time.monotonic() < until_s:
+        while not done() and time.monotonic() < until_s and not self._stop.is_set():
             self._work_devices(time.monotonic())
             time.sleep(ROUND_PAUSE_S)
-        return ended
 
     # --- status and end
 

@@ -28,6 +28,7 @@ import structlog
 
 from drivers.errors import RecordingError
 from monitor.common.folder_lock import HISTORY_LOCK, FolderLock
+from monitor.common.unexpected_errors import RestartedThread, log_unexpected_error
 from monitor.history.history_row import HistoryRow
 from monitor.history.sqlite_store import (
     DELETED,
@@ -83,14 +84,15 @@ class HistoryWriter:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._store: HistoryFileWriter | None = None
-        self._thread = threading.Thread(target=self._run, name="history", daemon=True)
+        self._thread = RestartedThread(self._run, "history", self._closing)
 
     @property
     def state(self) -> str:
         """Status text, which is "ok" or describes a problem."""
         dropped = f"{self.dropped} results not stored" if self.dropped else ""
-        if self._error:
-            return f"{self._error} ({dropped})" if dropped else self._error
+        error = self._thread.failure or self._error
+        if error:
+            return f"{error} ({dropped})" if dropped else error
         but = "; ".join(filter(None, (self._note, self._folder.warning, dropped)))
         return f"ok, but {but}" if but else "ok"
 
@@ -162,9 +164,7 @@ class HistoryWriter:
             self._resume()
             store = self._current_store()
             while batch := self._next_batch():
-                rows = [(device, what) for device, what in batch if isinstance(what, HistoryRow)]
-                events = [(device, what) for device, what in batch if isinstance(what, StoredEvent)]
-                store.write_rows_and_events(rows, events)
+                self._write_batch(store, batch)
                 self._remove_written(len(batch))
             while (
                 store.merge_old_rows(self._now_s(), MERGES_PER_STEP)
@@ -183,6 +183,22 @@ class HistoryWriter:
             return False
         self._set_error("")
         return True
+
+    def _write_batch(self, store: HistoryFileWriter, batch: list[tuple[str, HistoryRow | StoredEvent]]) -> None:
+        """Write a batch in one transaction. If an unexpected exception occurs, drop only the item that causes it."""
+        rows = [(device, what) for device, what in batch if isinstance(what, HistoryRow)]
+        events = [(device, what) for device, what in batch if isinstance(what, StoredEvent)]
+        try:
+            store.write_rows_and_events(rows, events)
+        except (sqlite3.Error, RecordingError, OSError):
+            raise
+        except Exception as error:  # noqa: BLE001 - the status shows the number of dropped items
+            if len(batch) == 1:
+                self.dropped += 1
+                log_unexpected_error(f"history of {batch[0][0]}", error)
+                return
+            for one in batch:
+                self._write_batch(store, [one])
 
     def _suspend(self, holder: str) -> None:
         self._close_store()

@@ -15,6 +15,7 @@ import structlog
 from drivers.data_types import Chunk
 from drivers.decoders.base import Decoder
 from drivers.errors import LinkUnavailable
+from monitor.common.unexpected_errors import RestartedThread
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.encoding_sensor import SimulatedSensor
 from monitor.simulator.faults import DrawnFaults, FaultCounts, FaultKind, Faults
@@ -60,7 +61,7 @@ class SimulatedDevice:
         self._back_at: int | None = None  # number of the sample before which the cable is connected again
         self.port = create_port(decoder.carrier, table.silence)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
+        self._thread = RestartedThread(self._run, "virtual imu", self._stop)
 
     def start(self) -> None:
         """Connect the simulated device, and start sending samples."""

@@ -1,13 +1,14 @@
 """Status report of one device, with sample counts, latency, and a message about a problem."""
 
 import time
+from typing import TYPE_CHECKING
 
 from drivers.secret_masking import mask_secrets
 from monitor.common.device_health import Health
 from monitor.daemon.device.latency_meter import LatencyMeter
-from monitor.daemon.device.ring_buffer import RingBuffer
-from monitor.daemon.device.window_restore import WindowRestore
-from monitor.daemon.result_publisher import ResultPublisher
+
+if TYPE_CHECKING:
+    from monitor.daemon.device.device_worker import DeviceWorker
 
 
 class DeviceStatus:
@@ -15,21 +16,13 @@ class DeviceStatus:
 
     Parameters
     ----------
-    publisher : ResultPublisher
-        Publisher of the results, with the driver, the pipeline and the user limits.
-    ring : RingBuffer
-        Ring buffer of the device.
-    restore : WindowRestore
-        Restore of the window after a restart of the program.
+    worker : DeviceWorker
+        Worker of the device.
     """
 
-    def __init__(self, publisher: ResultPublisher, ring: RingBuffer, restore: WindowRestore) -> None:
+    def __init__(self, worker: "DeviceWorker") -> None:
         self.latency = LatencyMeter()
-        self._publisher = publisher
-        self._driver = publisher.driver
-        self._pipeline = publisher.pipeline
-        self._ring = ring
-        self._restore = restore
+        self._worker = worker
         self._started_s = time.monotonic()
 
     def build_health(self, states: dict[str, str], memory_bytes: int) -> Health:
@@ -42,11 +35,8 @@ class DeviceStatus:
         memory_bytes : int
             Resident memory of the process.
         """
-        driver, clock, motion_and_change_monitor = (
-            self._driver,
-            self._driver.clock,
-            self._pipeline.motion_and_change_monitor,
-        )
+        worker, driver, clock = self._worker, self._worker.driver, self._worker.clock
+        motion_and_change_monitor = worker.pipeline.motion_and_change_monitor
         median_s, high_s = self.latency.take_latency_quantiles()
         return Health(
             state=driver.state,
@@ -54,7 +44,7 @@ class DeviceStatus:
             received=driver.counts.received,
             lost=driver.counts.lost,
             bad=driver.counts.bad,
-            overflowed=self._ring.overflowed,
+            overflowed=worker.ring.overflowed,
             latency_p50_s=median_s,
             latency_p99_s=high_s,
             memory_bytes=memory_bytes,
@@ -65,39 +55,58 @@ class DeviceStatus:
             late=clock.dropped_late_rows + driver.counts.late,
             moving=motion_and_change_monitor is not None and motion_and_change_monitor.is_moving,
             moved=motion_and_change_monitor.samples_in_motion if motion_and_change_monitor is not None else 0,
-            crossed=self._publisher.limits.coefficients_beyond_limits,
+            crossed=worker.publisher.limits.coefficients_beyond_limits,
+        )
+
+    def build_health_of_failed_device(self, states: dict[str, str], memory_bytes: int) -> Health:
+        """Return the status of a device whose estimation has failed, from the counts of the reader only."""
+        driver = self._worker.driver
+        counts, uptime_s = driver.counts, time.monotonic() - self._started_s
+        return Health(
+            state=driver.state,
+            rate_hz=None,
+            received=counts.received,
+            lost=counts.lost,
+            bad=counts.bad,
+            overflowed=self._worker.ring.overflowed,
+            latency_p50_s=None,
+            latency_p99_s=None,
+            memory_bytes=memory_bytes,
+            outputs=dict(states),
+            text=f"{self._worker.failure}; the estimation is being started again",
+            uptime_s=uptime_s,
         )
 
     def _text(self) -> str:
         """Return the status message of the device, or "" if there is no problem."""
-        driver, ready = self._driver, self._pipeline.ready
+        worker, driver, ready = self._worker, self._worker.driver, self._worker.pipeline.ready
         if driver.state == "running":
-            if self._restore.active and ready.all.is_set():
+            if worker.restore.active and ready.all.is_set():
                 return "the window is being rebuilt from the recording; no sample is lost"
             if ready.progress:
-                lacking = "" if self._pipeline.fit_kernels_can_run else "no coefficients yet, "
+                lacking = "" if worker.pipeline.fit_kernels_can_run else "no coefficients yet, "
                 return f"{ready.progress}; {lacking}no sample is lost"
-            if not self._pipeline.fit_kernels_can_run:
+            if not worker.pipeline.fit_kernels_can_run:
                 return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
             return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
-        offset_text = self._publisher.timeline.host_clock_offset_text()
+        offset_text = worker.timeline.host_clock_offset_text()
         return lacking or driver.late_frames_hint or offset_text or driver.on_board_filter_note
 
     def _missing_estimate_text(self) -> str:
         """Return the reason why coefficients cannot be estimated, or ""."""
-        clock = self._driver.clock
+        worker, clock = self._worker, self._worker.clock
         measured_hz = clock.contradicting_rate_hz
         if measured_hz is not None:
             return (
                 f"measured rate {measured_hz:.4g} Hz differs from the configured "
-                f"{self._publisher.device.rate_hz:g} Hz; coefficients are withheld: correct `rate` or remove it"
+                f"{worker.device.rate_hz:g} Hz; coefficients are withheld: correct `rate` or remove it"
             )
         if (
-            self._pipeline.estimator is None
-            and self._publisher.published
+            worker.pipeline.estimator is None
+            and worker.publisher.published
             and clock.configured_or_measured_rate_hz is None
         ):
             return "no estimate: the times of the samples do not show a rate; set `rate`"
-        return self._pipeline.refusal_reason
+        return worker.pipeline.refusal_reason

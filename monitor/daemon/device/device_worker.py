@@ -6,23 +6,27 @@ In each round of the main loop, ``DeviceWorker.process_new_samples`` takes the n
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 from drivers.data_types import Chunk, Floats, SampleBlock
 from drivers.driver import Driver
+from drivers.errors import ImuError
 from drivers.host.wake_signal import WakeSignal
 from drivers.links.base import BatchingLink, Link
 from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.device_health import Health
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.daemon.device.device_status import DeviceStatus
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.device.ring_buffer import RingBuffer
+from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.device.window_restore import WindowRestore
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.coefficient_limits import LimitMonitor, read_model_in_force
-from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.output import Output, call_outputs
 from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder
 from monitor.estimation.window_sample_snapshot import WindowSnapshot
@@ -47,6 +51,10 @@ publishes at once, so that the wait does not delay the newest sample of a result
 """
 REPLAY_PAUSE_S: Final = 0.002
 """Interval at which the reader of a replayed recording checks a full queue."""
+MIN_RESTART_PAUSE_S: Final = 1.0
+"""Pause before the estimation is started anew after an unexpected exception. The pause doubles with each exception."""
+MAX_RESTART_PAUSE_S: Final = 32.0
+"""Longest pause before the estimation is started anew. The ring buffer holds the samples of this time."""
 MODEL_SELECTION_S: Final = 0.001
 """Processor time per round for the selection of a thermal model of a live sensor."""
 MODEL_SELECTION_REPLAY_S: Final = 0.02
@@ -109,41 +117,74 @@ class DeviceWorker:
         )
         # otherwise, a short recording could end before the kernels of change detection are compiled
         self.waits_for_all = device.refit_s == 0.0 or device.leave_out_motion or isinstance(link, ReplayLink)
-        live = device.refit_s != 0.0 and timed and not isinstance(link, ReplayLink)
-        self.pipeline = DevicePipeline(device, self.model, ready, self._replayed, self.waits_for_all, live)
-        limits = LimitMonitor(device.limits, self.model)
-        self.publisher = ResultPublisher(device, self.driver, self.pipeline, limits, outputs)
-        self.timeline = self.publisher.timeline
-        self.restore = WindowRestore(device, self.pipeline, self.clock, self.timeline)
-        self.status = DeviceStatus(self.publisher, self.ring, self.restore)
+        self._live = device.refit_s != 0.0 and timed and not isinstance(link, ReplayLink)
+        self.timeline = DeviceTimeline(self.driver)
+        self.status = DeviceStatus(self)
         self.simulated = simulated
+        self.failure = ""
+        """Reason why the estimation must be started anew, or ""."""
+        self._failures = 0
+        self._restart_s: float | None = None  # monotonic time at which the estimation is started anew
+        self._outputs = outputs
+        self._ready = ready
         self._recorder = recorder
         self._wake = wake
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
+        self._unstarted = [one for one in (simulated, self._thread) if one is not None]
+        self._start_estimation(published=0)
+
+    def _start_estimation(self, published: int) -> None:
+        """Create the pipeline and the publisher of the device, with an empty window."""
+        device = self.device
+        self.pipeline = DevicePipeline(device, self.model, self._ready, self._replayed, self.waits_for_all, self._live)
+        limits = LimitMonitor(device.limits, self.model)
+        self.publisher = ResultPublisher(device, self.driver, self.timeline, self.pipeline, limits, self._outputs)
+        self.publisher.published = published
+        self.restore = WindowRestore(device, self.pipeline, self.clock, self.timeline)
         self._rate_doubts = (False, False)  # configured rate is contradicted; configured rate is not checked yet
 
     # --- start and stop
 
     def start_reader_and_resume_recording(self) -> None:
         """Start the reader thread, and continue a recording that ended less than one window ago."""
-        if self.simulated is not None:
-            self.simulated.start()
-        if self._recorder is not None and not self._replayed:
-            self.restore.resume_from(self._recorder.find_last_recorded_samples(self.name))
-            if self.restore.active:  # the program may restart before a new estimate is available
-                self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
-        self._thread.start()
+        with self._contain_errors():
+            if self._recorder is not None and not self._replayed:
+                self.restore.resume_from(self._recorder.find_last_recorded_samples(self.name))
+                if self.restore.active:  # the program may restart before a new estimate is available
+                    self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
+        with self._contain_errors():
+            self._start_threads()
+
+    def _start_threads(self) -> None:
+        """Start the threads that could not be started yet, because the system allowed no more threads."""
+        while self._unstarted:
+            self._unstarted[0].start()
+            del self._unstarted[0]
 
     def refill_window_from_recording(self) -> None:
         """Fill the window from the recording, while new samples wait in the ring buffer."""
-        self.restore.refill_window_from_recording()
+        with self._contain_errors():
+            self.restore.refill_window_from_recording()
         self._wake.set()
+
+    @contextmanager
+    def _contain_errors(self) -> Iterator[None]:
+        """Start the estimation anew after an exception, so that the other devices continue."""
+        try:
+            yield
+        except (ImuError, OSError) as error:
+            self.failure = str(error)
+        except Exception as error:  # noqa: BLE001 - the status of the device shows the error
+            self.failure = log_unexpected_error(f"device {self.name}", error)
 
     def stop_reader_thread(self) -> None:
         """Stop the reader thread. Samples in the ring buffer are kept."""
-        self.driver.stop()
-        if self.simulated is not None:
-            self.simulated.stop()
+        self._unstarted.clear()
+        with self._contain_errors():
+            self.driver.stop()
+        with self._contain_errors():
+            if self.simulated is not None:
+                self.simulated.stop()
 
     def join_reader_thread(self, timeout_s: float) -> bool:
         """Wait for the end of the reader thread, and return False after a timeout."""
@@ -180,11 +221,30 @@ class DeviceWorker:
         drain : bool, optional
             True to process all samples and publish all results, because the device stops.
         """
-        self.publisher.schedule.begin_round(now_s, drain)
-        with self.pipeline.interpret_kernels_if_uncompiled(self.clock.configured_or_measured_rate_hz):
-            self._process_new_samples(drain)
+        with self._contain_errors():
+            if self.failure and not self._recover(now_s):
+                return
+            self.publisher.schedule.begin_round(now_s, drain)
+            with self.pipeline.interpret_kernels_if_uncompiled(self.clock.configured_or_measured_rate_hz):
+                self._process_new_samples(drain)
+
+    def _recover(self, now_s: float) -> bool:
+        """Start the estimation anew after a pause that doubles with each failure; return True if it was started."""
+        if self._restart_s is None:
+            self._restart_s = now_s + min(MIN_RESTART_PAUSE_S * 2**self._failures, MAX_RESTART_PAUSE_S)
+        if now_s < self._restart_s:
+            return False
+        self._failures, self._restart_s = self._failures + 1, None
+        failure, self.failure = self.failure, ""
+        self._start_estimation(self.publisher.published)
+        self._start_threads()
+        self.timeline.add_event_now("estimation_restarted", f"{failure}; the window starts empty")
+        return True
 
     def _process_new_samples(self, drain: bool) -> None:
+        error, self.driver.unexpected_error = self.driver.unexpected_error, None
+        if error is not None:
+            log_unexpected_error(f"reader of {self.name}", error)
         events = self.driver.take_events()
         if self.restore.active:  # another thread uses the pipeline
             self.publisher.publish_events(self.timeline.take_events() + events)
@@ -306,14 +366,18 @@ class DeviceWorker:
         Health
             Published status.
         """
-        self.timeline.slew_to_host_clock()
-        self.publisher.publish_events(self.timeline.take_events())
-        self._update_rate()
-        if self._recorder is not None:
-            self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
-        health = self.status.build_health(states, memory_bytes)
-        for output in self.publisher.outputs:
-            output.publish_health(self.name, self.timeline.now_unix_s(), health)
+        unix_s, health = None, None
+        with self._contain_errors():
+            self.timeline.slew_to_host_clock()
+            self.publisher.publish_events(self.timeline.take_events())
+            if not self.failure:
+                self._update_rate()
+                if self._recorder is not None:
+                    self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
+                health = self.status.build_health(states, memory_bytes)
+            unix_s = self.timeline.now_unix_s()
+        health = health or self.status.build_health_of_failed_device(states, memory_bytes)
+        call_outputs(self._outputs, "publish_health", self.name, unix_s, health)
         return health
 
     # --- called by the reader thread

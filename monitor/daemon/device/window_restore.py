@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from drivers.data_types import AXES, Event, Ints, SampleBlock, make_block
-from drivers.errors import ImuError
 from drivers.recordings.segment_file import DaemonState
 from drivers.timing.sample_clock import LastSample, SampleClock
 from monitor.daemon.device.pipeline import DevicePipeline
@@ -19,6 +18,10 @@ from monitor.daemon.device.unix_timeline import DeviceTimeline
 from monitor.daemon.storage.last_recorded_samples import LastRecordedSamples
 from monitor.settings.loading import Device
 
+MIN_RATE_SAMPLES: Final = 5
+"""Minimum number of newest samples from which the recorded rate is checked."""
+MAX_RATE_RATIO: Final = 2.0
+"""Maximum ratio of the recorded rate and the rate of the newest samples, whose times have jitter."""
 MIN_REPLAY_S: Final = 600.0
 """Minimum duration in s of the replayed recording. Change detection needs this duration."""
 
@@ -59,30 +62,33 @@ class WindowRestore:
         t_ns = int(newest.t_ns[-1]) - self._timeline.unix_offset_ns(time.monotonic_ns())
         ago_s = (time.time_ns() - int(newest.t_ns[-1])) / 1e9
         rate_hz = self._device.rate_hz or state.rate
-        if rate_hz is None or not 0.0 <= ago_s <= self._device.window_s:
-            text = f"the recording ended {ago_s:.4g} s ago; the window starts empty"
-            if ago_s < 0.0:
-                text = "the recording ends later than the present time of the host clock; the window starts empty"
-            self._timeline.add_event_now("window_rebuilt", text)
+        reason = tail.newest.state_error or _contradiction(newest, state)
+        if ago_s < 0.0:
+            reason = "the recording ends later than the present time of the host clock"
+        elif not reason and (rate_hz is None or ago_s > self._device.window_s):
+            reason = f"the recording ended {ago_s:.4g} s ago"
+        if reason or rate_hz is None:
+            self._timeline.add_event_now("window_rebuilt", f"{reason}; the window starts empty")
             return
         self._clock.resume_after_restart(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
         self._tail, self._state_before = tail, state
 
     def refill_window_from_recording(self) -> None:
-        """Fill the window from the recording, while new samples wait in the ring buffer."""
+        """Fill the window from the recording, while new samples wait in the ring buffer.
+
+        Raises
+        ------
+        ImuError or OSError
+            If the recording cannot be read. The pipeline then contains a part of the recording and must be replaced.
+        """
         tail = self._tail
         if tail is None:
             return
         offset_ns = self._timeline.unix_offset_ns(time.monotonic_ns())
-        try:
-            text = self._replay(tail, offset_ns)
-        except (ImuError, OSError) as error:
-            text = f"the window could not be rebuilt from the recording: {error}"
-            self._pipeline.empty_window()
-        finally:
-            t_ns = int(tail.newest.samples.t_ns[-1]) - offset_ns
-            self._timeline.add_event(Event("window_rebuilt", t_ns, text))
-            self._tail = None
+        text = self._replay(tail, offset_ns)
+        t_ns = int(tail.newest.samples.t_ns[-1]) - offset_ns
+        self._timeline.add_event(Event("window_rebuilt", t_ns, text))
+        self._tail = None
 
     def state_to_record(self) -> DaemonState:
         """Return the current state of the estimate, which is recorded with the samples."""
@@ -122,6 +128,19 @@ class WindowRestore:
             pipeline.estimator.restore_fit(np.array(state.entered).reshape(shape), theta)
         filled_s = pipeline.estimator.samples_in_window / pipeline.estimator.rate_hz
         return f"{filled_s:.6g} s of the window were rebuilt from the recording"
+
+
+def _contradiction(newest: SampleBlock, state: DaemonState) -> str:
+    """Return the reason why a recorded state cannot belong to the newest samples of the recording, or ""."""
+    if any(unix_s is not None and unix_s > time.time() + 1.0 for unix_s in state.since):
+        return "the recorded state is damaged (since is later than the present time of the host clock)"
+    span_s = int(newest.t_ns[-1] - newest.t_ns[0]) / 1e9
+    if state.rate is None or len(newest) < MIN_RATE_SAMPLES or span_s <= 0.0:
+        return ""
+    rate_hz = (len(newest) - 1) / span_s
+    if rate_hz / MAX_RATE_RATIO < state.rate < rate_hz * MAX_RATE_RATIO:
+        return ""
+    return f"the recorded state is damaged (rate {state.rate:g} Hz, but the samples have {rate_hz:.4g} Hz)"
 
 
 def _count_since_restart(samples: SampleBlock, state: DaemonState) -> Ints:

@@ -29,6 +29,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from monitor.common.program_command_line import PROGRAM
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.estimation.window_sample_snapshot import WindowSnapshot
 from monitor.publishing.messages.results import ReconcileReply
 from monitor.publishing.zenoh.publisher import Command
@@ -131,9 +132,11 @@ class Reconciler:
     def _run(self, job: WindowCopyForReconcile, command: Command) -> None:
         try:
             result, status, folder = self._reconcile(job)
-        except (OSError, RuntimeError) as error:
-            command.reply_refusal(str(error))
-            self._finished.put(ReconciliationOutcomeText(job.device, f"reconcile failed: {error}"))
+        except Exception as error:  # noqa: BLE001 - the reply contains the error
+            expected = isinstance(error, OSError | RuntimeError)
+            text = str(error) if expected else log_unexpected_error(f"reconcile of {job.device}", error)
+            command.reply_refusal(text)
+            self._finished.put(ReconciliationOutcomeText(job.device, f"reconcile failed: {text}"))
             return
         head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
         command.reply_result(head.encode_report(result, status, folder, KEPT_REPORTS))

@@ -30,6 +30,8 @@ class HistoryOutput(Output):
         Folder of the history file.
     """
 
+    name = "history"
+
     def __init__(self, folder: Path) -> None:
         self.writer = HistoryWriter(folder / FILE_NAME, time.time)
         self._received: dict[str, int] = {}  # number of samples of each device since the start

@@ -20,6 +20,7 @@ import structlog
 
 from drivers.errors import ConfigError, describe_error, make_printable_and_shorten
 from monitor.common.device_health import Health
+from monitor.common.unexpected_errors import RestartedThread
 from monitor.common.unit_formatting import format_count
 from monitor.daemon.outputs.newest_metrics import NamedMetric, NewestMetrics
 from monitor.settings.token_file import read_token
@@ -58,6 +59,8 @@ class InfluxOutput(NewestMetrics):
         Interval between two batches in seconds. The status of the devices sets a lower limit of one second.
     """
 
+    name = "influx"
+
     def __init__(self, url: str, token_file: Path | None, interval_s: float) -> None:
         super().__init__()
         self._url = url
@@ -71,14 +74,15 @@ class InfluxOutput(NewestMetrics):
         self._opener = urllib.request.build_opener(_RedirectRefusal)
         self._wake = threading.Event()
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="influx", daemon=True)
+        self._thread = RestartedThread(self._run, "influx", self._closing)
 
     @property
     def state(self) -> str:
         """Status message: ``ok``, or a description of the problem."""
         dropped = f"{format_count(self._dropped, 'point')} not stored" if self._dropped else ""
-        if self._error:
-            return f"{self._error} ({dropped})" if dropped else self._error
+        error = self._thread.failure or self._error
+        if error:
+            return f"{error} ({dropped})" if dropped else error
         return f"ok, but {dropped}" if dropped else "ok"
 
     def start(self) -> None:

@@ -1,9 +1,12 @@
 """Base class of the receivers of the results: zenoh, viewer, history, log, table, metrics, InfluxDB, ROS 2, hooks."""
 
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 from drivers.data_types import Event, Ints, SampleBlock
 from monitor.common.device_health import Health
+from monitor.common.unexpected_errors import RecentFailure
 from monitor.settings.loading import Device
 
 
@@ -26,6 +29,14 @@ class Output:
     offset_ns : array of int64, shape (n,), or int
         Offset that converts the times of the samples to Unix time, in nanoseconds.
     """
+
+    name = "other"
+    """Name of the output in the status."""
+
+    @cached_property
+    def failure(self) -> RecentFailure:
+        """Unexpected exception of the output."""
+        return RecentFailure()
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of samples."""
@@ -58,3 +69,22 @@ class Output:
 
     def remove_device(self, device: str) -> None:
         """Remove the data of a device that was removed from the configuration."""
+
+
+def call_outputs(outputs: Sequence[Output], method: str, *arguments: Any) -> None:
+    """Call a method of all outputs. An unexpected exception in one output does not affect the others.
+
+    Parameters
+    ----------
+    outputs : sequence of Output
+        Receivers of the call.
+    method : str
+        Name of the method.
+    *arguments
+        Arguments of the method.
+    """
+    for output in outputs:
+        try:
+            getattr(output, method)(*arguments)
+        except Exception as error:  # noqa: BLE001 - the status of the output shows the error
+            output.failure.note(f"output {output.name}", error)

@@ -28,6 +28,8 @@ class Ros2Output(NewestMetrics):
         Settings of the devices.
     """
 
+    name = "ros2"
+
     def __init__(self, settings: Ros2Table, devices: Sequence[Device]) -> None:
         super().__init__()
         assert settings.domain is not None

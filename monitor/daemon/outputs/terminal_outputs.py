@@ -26,6 +26,8 @@ _log = structlog.get_logger("imu-monitor")
 class EventAndStatusLogOutput(Output):
     """Output that writes events and changes of the status as log lines."""
 
+    name = "log"
+
     def __init__(self) -> None:
         self._last_status: dict[str, tuple[str, str]] = {}
 
@@ -66,6 +68,8 @@ class TableOutput(Output):
     request_redraw : callable, optional
         Function that requests another thread to draw the table.
     """
+
+    name = "terminal"
 
     def __init__(self, states: RemoteDeviceRegistry, request_redraw: Callable[[], None] | None = None) -> None:
         self.states = states

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 class ViewerOutput(Output):
     """Output that shows the results in the Rerun viewer."""
 
+    name = "viewer"
+
     def __init__(self, view: "RerunView") -> None:
         self._view = view
 

@@ -18,6 +18,8 @@ from monitor.settings.loading import Device
 class ZenohOutput(Output):
     """Output that publishes the results as zenoh messages."""
 
+    name = "zenoh"
+
     def __init__(self, zenoh: ZenohPublisher) -> None:
         self._zenoh = zenoh
 

@@ -55,17 +55,26 @@ def read_last_recorded_samples(origin: SegmentMetadata, folder: Path) -> LastRec
         Metadata of the recording, with the axis mounting.
     folder : Path
         Folder of the segments.
+
+    Raises
+    ------
+    RecordingError or OSError
+        If no file can be read as a segment.
     """
     paths = segment_file.list_segments(folder)
+    failure: Exception | None = None
     while paths:
         path = paths[-1]
         try:
             if segment_file.read_metadata(path).axes != origin.axes:
                 return None
             newest = segment_file.read_last_piece(path)
-        except (RecordingError, ConfigError, OSError):
-            newest = None
+        except (RecordingError, ConfigError, OSError) as error:
+            newest, failure = None, failure or error
         if newest is not None:
             return LastRecordedSamples(origin, tuple(paths), newest)
+        failure = failure or RecordingError(f"{path}: contains no complete batch of samples")
         paths.pop()
+    if failure is not None:
+        raise failure
     return None

@@ -25,6 +25,7 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
+from monitor.common.unexpected_errors import RestartedThread
 from monitor.daemon.storage import retention
 from monitor.daemon.storage.last_recorded_samples import LastRecordedSamples, read_last_recorded_samples
 from monitor.daemon.storage.recording_track import (
@@ -75,10 +76,11 @@ class Recorder:
         self._events: deque[RecorderEvent] = deque(maxlen=1000)
         # replaced as a whole, because several threads iterate over the dictionary
         self._tracks: dict[tuple[str, str], RecordingTrack] = {}
-        self._lock = threading.Lock()  # protects the replacement of the dictionary
+        self._leaving: tuple[RecordingTrack, ...] = ()  # recordings of removed devices, which end in the next round
+        self._lock = threading.Lock()  # protects the replacement of ``_tracks`` and ``_leaving``
         self._states: dict[str, DaemonState] = {}
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = RestartedThread(self._run, "recorder", self._closing)
         self._delete_checked_s = self._synced_s = -DELETE_INTERVAL_S
         self._packing: Iterator[None] | None = None
         self._finished: deque[Path] = deque()  # segments to compress
@@ -98,20 +100,19 @@ class Recorder:
 
     def remove_device(self, device: str) -> None:
         """Stop the recording of a device as soon as the queue has been written."""
-        for track in self._tracks.values():
-            track.leaving |= track.origin.device == device
+        with self._lock:
+            self._leaving += tuple(track for (name, _), track in self._tracks.items() if name == device)
+            self._tracks = {key: track for key, track in self._tracks.items() if key[0] != device}
 
     def is_recording(self, device: str) -> bool:
         """Return True while a device is recorded or the queue of the device is not empty."""
-        return any(name == device for name, _ in self._tracks)
+        return any(track.origin.device == device for track in (*self._tracks.values(), *self._leaving))
 
     @property
     def state(self) -> str:
         """Status message: ``ok``, or a description of the problem."""
-        if self._thread.ident is not None and not self._thread.is_alive() and not self._closing.is_set():
-            return "the recording ended because of an error in the program"
-        if self._lock_failure:
-            return self._lock_failure
+        if self._thread.failure or self._lock_failure:
+            return self._thread.failure or self._lock_failure
         troubles = sorted({track.trouble for track in self._tracks.values() if track.trouble})
         if troubles:
             return troubles[0]
@@ -217,13 +218,18 @@ class Recorder:
         while not closing:
             locked = self._acquire_folder()
             closing = self._closing.wait(WRITE_INTERVAL_S)
-            for key, track in self._tracks.items():
-                leaving = track.leaving  # read first, because the queue receives no rows after ``leaving`` is set
+            leaving = self._leaving
+            for track in (*self._tracks.values(), *leaving):
                 if locked:
-                    self._note = track.close_if_file_changed() or self._note
-                    track.write_queued_rows(self._states.get(track.origin.device, DaemonState()), self._disk_full)
-                if leaving:
-                    self._remove_track(key)
+                    try:
+                        self._note = track.close_if_file_changed() or self._note
+                        track.write_queued_rows(self._states.get(track.origin.device, DaemonState()), self._disk_full)
+                    except Exception as error:  # noqa: BLE001 - the status of the recording shows the error
+                        track.drop_rows_after_error(error)
+            for track in leaving:
+                track.close_segment()
+            with self._lock:
+                self._leaving = self._leaving[len(leaving) :]
             if locked and not closing:
                 self._sync()
                 self._delete_old()
@@ -231,11 +237,6 @@ class Recorder:
         for track in self._tracks.values():
             track.close_segment()
         self._folder_lock.release()
-
-    def _remove_track(self, key: tuple[str, str]) -> None:
-        self._tracks[key].close_segment()
-        with self._lock:
-            self._tracks = {other: track for other, track in self._tracks.items() if other != key}
 
     def _acquire_folder(self) -> bool:
         """Acquire or check the lock on the folder; return False if the lock is not held."""

@@ -21,6 +21,7 @@ from drivers.host.safe_file_reading import check_folder_or_absent
 from drivers.recordings import segment_file
 from drivers.recordings.segment_file import DaemonState, SegmentFileWriter, SegmentMetadata
 from drivers.recordings.table import PARTIAL_SUFFIX
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.settings.loading import Storage
 
 RETRY_S: Final = 5.0
@@ -90,8 +91,6 @@ class RecordingTrack:
         """Number of rows that are missing in the recording."""
         self.trouble = ""
         """Reason why the recording has stopped, or ""."""
-        self.leaving = False
-        """True if the device was removed, so that the recording ends when the queue is empty."""
         self._segment_s = storage.segment_s
         self._opening = opening
         self._events = events
@@ -208,6 +207,19 @@ class RecordingTrack:
             if self.trouble:
                 self.trouble = ""
                 self.queue_continuation_event()
+
+    def drop_rows_after_error(self, error: Exception) -> None:
+        """Close the segment and drop the rows that could not be written, after an unexpected exception.
+
+        Parameters
+        ----------
+        error : Exception
+            Exception of ``write_queued_rows``, which would be raised again for the same rows.
+        """
+        self._report_failure(f"{self.folder}: {log_unexpected_error(f'recording of {self.origin.device}', error)}")
+        self.missed += sum(len(one) if isinstance(one, SampleBlock) else 1 for one in self._taken)
+        self._taken = []
+        self.close_segment(pack=False)
 
     def sync_segment_to_disk(self) -> None:
         """Flush the open segment to the disk."""

@@ -78,8 +78,10 @@ class Ros2Publisher(RetriedSession):
     def state(self) -> str:
         """``ok`` or a description of the problem, for the status message."""
         session = self._session
-        if session is None or self._error:
-            return self._error or self._session_state
+        if wrong := self.failure or self._error:
+            return wrong
+        if session is None:
+            return self._session_state
         if is_unconnected(session):
             return f"{self._missing_router_text()}; trying again"
         unsent = self._unsent_messages + self._queue.dropped_weight

@@ -100,8 +100,10 @@ class ZenohPublisher(RetriedSession):
     def state(self) -> str:
         """``ok`` or a description of the problem, for the status message."""
         session = self._session
-        if self._unsent or session is None:
-            return self._unsent or self._session_state
+        if wrong := self.failure or self._unsent:
+            return wrong
+        if session is None:
+            return self._session_state
         if self._connect and is_unconnected(session):
             return f"{self._refusal or 'nobody at ' + mask_secrets(', '.join(self._connect))}; trying again"
         duplicates = self._duplicates.duplicate_publisher_message(time.monotonic())

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
+from monitor.common.unexpected_errors import RecentFailure, RestartedThread
+
 if TYPE_CHECKING:
     import zenoh
 
@@ -26,8 +28,14 @@ class RetriedSession:
     def __init__(self, name: str) -> None:
         self.closing = threading.Event()
         self._session: zenoh.Session | None = None
-        self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {name}", daemon=True)
+        self._opener = RestartedThread(self._keep_open, f"zenoh {name}", self.closing)
+        self._receiver_failure = RecentFailure()
         self._receivers: list[threading.Thread] = []
+
+    @property
+    def failure(self) -> str:
+        """Description of a recent unexpected exception in a thread of the session for the status, or ""."""
+        return self._opener.failure or self._receiver_failure.text
 
     def start(self) -> None:
         """Start the thread that opens the session."""
@@ -55,13 +63,16 @@ class RetriedSession:
     def _keep_open(self) -> None:
         """Open the session, retrying on failure, and then run until the session is closed."""
         errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
-        while not self.closing.is_set():
+        while self._session is None and not self.closing.is_set():
             try:
                 self._open_session()
             except errors as error:
                 self._close_session()
                 self._report_failure(error)
                 self.closing.wait(RETRY_S)
+            except Exception:
+                self._close_session()
+                raise
             else:
                 break
         self._work_until_closed()
@@ -89,7 +100,10 @@ class RetriedSession:
                 received = handler.recv()
             except zenoh_errors():
                 return
-            process(received)
+            try:
+                process(received)
+            except Exception as error:  # noqa: BLE001 - the status shows the error, and later messages are processed
+                self._receiver_failure.note(threading.current_thread().name, error)
 
 
 @cache

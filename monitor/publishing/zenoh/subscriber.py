@@ -108,6 +108,8 @@ class ZenohSubscriber:
     @property
     def state(self) -> str:
         """``ok`` or a description of the endpoints that are not connected."""
+        if failure := next((session.failure for session in self._sessions if session.failure), ""):
+            return failure
         absent = {session.endpoint: session.refusal for session in self._sessions if not session.is_connected}
         if not absent:
             return "ok"
