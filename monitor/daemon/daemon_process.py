@@ -19,13 +19,14 @@ from drivers.errors import ConfigError
 from drivers.host.wake_signal import WakeSignal
 from drivers.secret_masking import mask_secrets
 from monitor.common.device_health import Health, format_service_status
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.common.unit_formatting import UNIT_SYSTEMS
 from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.outputs.history_output import HistoryOutput
-from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.output import Output, call_outputs
 from monitor.daemon.outputs.viewer_output import ViewerOutput
 from monitor.daemon.outputs.zenoh_output import ZenohOutput
 from monitor.history.bucketed_history import HistoryTable
@@ -81,6 +82,8 @@ class DaemonProcess:
         self._wake = WakeSignal()
         self._stop = threading.Event()
         self._reload_asked = False
+        self._config_reader: threading.Thread | None = None  # reads the configuration file again
+        self._config_change: ConfigChange | ConfigError | None = None  # what the thread has found
         storage = config.storage
         self.history = HistoryOutput(storage.folder) if storage is not None and storage.history else None
         answer_query = None if self.history is None else self.history.answer_query
@@ -130,13 +133,15 @@ class DaemonProcess:
             if now_s >= status_s:
                 status_s = now_s + STATUS_INTERVAL_S
                 self._publish_status()
-            for output in self.outputs:
-                output.finish_round()
+            call_outputs(self.outputs, "finish_round")
             if self._has_ended() or (until_s is not None and now_s >= until_s):
                 return
-            if self._reload_asked:
+            if self._reload_asked and self._config_reader is None:
                 self._reload_asked = False
-                self._reload()
+                self._begin_reload()
+            if self._config_change is not None:
+                self._config_reader, self._config_change, change = None, None, self._config_change
+                self._finish_reload(change)
             self._wait(now_s)
 
     def output_states(self) -> dict[str, str]:
@@ -151,7 +156,9 @@ class DaemonProcess:
             "hook": self.hooks if self.hooks.hooks else None,
             **self._writers,
         }
-        return {name: mask_secrets(output.state) for name, output in outputs.items() if output is not None}
+        states = {name: output.state for name, output in outputs.items() if output is not None}
+        states |= {output.name: output.failure.text for output in self.outputs if output.failure.text}
+        return {name: mask_secrets(state) for name, state in states.items()}
 
     # --- defined by the subclasses
 
@@ -180,7 +187,10 @@ class DaemonProcess:
         raise NotImplementedError
 
     def _find_changes(self) -> ConfigChange:
-        """Return the changes since the configuration was read. Raise ConfigError if the new one is invalid."""
+        """Return the changes since the configuration was read. Raise ConfigError if the new one is invalid.
+
+        Another thread calls this method.
+        """
         raise NotImplementedError
 
     def _apply(self, change: ConfigChange) -> None:
@@ -199,11 +209,30 @@ class DaemonProcess:
                 if output is not None:
                     output.close()
 
-    def _reload(self) -> None:
-        """Read the configuration again, and apply the changes if it contains no error."""
+    def _begin_reload(self) -> None:
+        """Read the configuration again in a thread, because a large file takes seconds."""
+
+        def read() -> None:
+            try:
+                self._config_change = self._find_changes()
+            except ConfigError as error:
+                self._config_change = error
+            except Exception as error:  # noqa: BLE001 - the log contains the error
+                self._config_change = ConfigError(log_unexpected_error("reload", error))
+            self._wake.set()
+
         self._unit.send_reloading()
+        self._config_reader = threading.Thread(target=read, name="reload", daemon=True)
         try:
-            change = self._find_changes()
+            self._config_reader.start()
+        except RuntimeError as error:  # the system allows no more threads
+            self._config_change = ConfigError(str(error))
+
+    def _finish_reload(self, change: ConfigChange | ConfigError) -> None:
+        """Apply the changes of the configuration, unless it contains an error."""
+        try:
+            if isinstance(change, ConfigError):
+                raise change
             self._apply(change)
         except ConfigError as error:
             _log.error("not reloaded, the running configuration stays in force", error=str(error))
@@ -255,8 +284,7 @@ class DaemonProcess:
         if page == self._viewer_url:
             return
         self._viewer_url = page
-        for output in self.outputs:
-            output.set_viewer_url(page)
+        call_outputs(self.outputs, "set_viewer_url", page)
 
     def _read_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows at the start, or None if there are no results.

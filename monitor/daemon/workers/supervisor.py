@@ -26,13 +26,13 @@ from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.daemon_process import MAX_IDLE_S, DaemonProcess, measure_memory_bytes
 from monitor.daemon.operations.coefficient_limits import read_model_in_force
 from monitor.daemon.operations.systemd import SystemdNotifier
-from monitor.daemon.outputs.output import Output
+from monitor.daemon.outputs.output import Output, call_outputs
 from monitor.daemon.workers.device_spreading import spread_devices
 from monitor.daemon.workers.worker_service import COMMAND, RELOAD, START, STOP, Call
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import Command
 from monitor.settings import loading
-from monitor.settings.loading import Config
+from monitor.settings.loading import Config, VirtualTable
 
 RESTART_PAUSE_S: Final = 2.0
 """Delay before a worker is restarted, long enough for the ended worker to finish its recording."""
@@ -49,7 +49,9 @@ class _Worker:
 
     def __init__(self, number: int) -> None:
         self.name = f"worker {number}"
-        self.devices: tuple[str, ...] = ()
+        self.devices: tuple[str, ...] = ()  # devices of the newest configuration, which the process may not have yet
+        self.generation = 0  # number of the newest configuration that was sent
+        self.ended_generation = -1  # number of the configuration with which the process ended
         self.progress: Mapping[str, int] = {}
         self.memory_bytes = 0
         self.restart_s: float | None = None  # monotonic time of the next start, or None
@@ -65,6 +67,7 @@ class _Worker:
                 [*PROGRAM, "worker", str(descriptor)], pass_fds=[descriptor], start_new_session=True
             )
             self.pipe, self.restart_s = pipes.Connection(ours.detach()), None
+        self.generation, self.ended_generation = 0, -1
         self.call(START, table, folder, os.getpid())
 
     def call(self, name: str, *arguments: Any) -> None:
@@ -139,17 +142,19 @@ class WorkerSupervisor(DaemonProcess):
         self._distribute_devices()
 
     def _distribute_devices(self) -> None:
-        """Give each worker its devices: start it, send it the new configuration, or ask it to stop."""
-        self._places = spread_devices(self.config.devices, len(self._workers), self._places)
+        """Give each worker its devices: start it, or send it the new configuration.
+
+        A worker without devices ends. The place of a removed device is kept, so that two processes never have it.
+        """
+        places = spread_devices(self.config.devices, len(self._workers), self._places)
+        self._places |= places
         for number, worker in enumerate(self._workers):
-            before, names = worker.devices, tuple(name for name, place in self._places.items() if place == number)
-            worker.devices = names
-            if worker.pipe is not None and names:
-                worker.call(RELOAD, *loading.select_devices(self.config, names))
-            elif worker.pipe is not None:
-                worker.call(STOP)
-            elif set(names) != set(before):
-                worker.restart_s = time.monotonic() if names else None
+            before, worker.devices = worker.devices, tuple(name for name, place in places.items() if place == number)
+            if worker.pipe is not None:
+                worker.generation += 1
+                worker.call(RELOAD, *loading.select_devices(self.config, worker.devices), worker.generation)
+            elif set(worker.devices) != set(before):
+                worker.restart_s = time.monotonic() if worker.devices else None
 
     # --- one round
 
@@ -179,7 +184,8 @@ class WorkerSupervisor(DaemonProcess):
         match call.name, call.arguments:
             case "publish_health", (device, unix_s, health):
                 worker.memory_bytes = health.memory_bytes
-                self._publish_health(device, unix_s, health)
+                if device in worker.devices:
+                    self._publish_health(device, unix_s, health)
             case "set_progress", (progress,):
                 worker.progress = progress
             case "log", (method, line):
@@ -187,22 +193,20 @@ class WorkerSupervisor(DaemonProcess):
             case ("reply_result" | "reply_refusal") as reply, (number, answer):
                 _, command = self._commands.pop(number)
                 getattr(command, reply)(answer)
+            case "ended", (generation,):
+                worker.ended_generation = generation
             case "refuse", (lines,):
                 if not self._stop.is_set():  # otherwise, another worker's refusal has already ended the daemon
                     raise ConfigError(*lines)
-            case "add_device", (name,):
-                for device in self.config.devices:
-                    if device.name == name:
-                        self._pass_on("add_device", device)
-            case method, arguments:
-                self._pass_on(method, *arguments)
+            case method, (device, *_) as arguments:
+                if device in worker.devices:  # otherwise, the device was removed in the meantime
+                    self._pass_on(method, *arguments)
 
     def _pass_on(self, method: str, *arguments: Any) -> None:
-        for output in self.outputs:
-            getattr(output, method)(*arguments)
+        call_outputs(self.outputs, method, *arguments)
 
     def _forward(self, command: Command) -> None:
-        worker = self._workers[self._places.get(command.device, 0)]
+        worker = self._workers[self._places[command.device]]
         if command.device not in worker.devices or worker.pipe is None:
             command.reply_refusal("the device is not running")
             return
@@ -221,12 +225,15 @@ class WorkerSupervisor(DaemonProcess):
         return all(worker.pipe is None and worker.restart_s is None for worker in self._workers)
 
     def _handle_end(self, worker: _Worker) -> None:
-        """Restart a worker that did not exit cleanly."""
+        """Restart a worker, unless its replays have ended or its devices were removed."""
         status = worker.reap()
         for number, (_, command) in [one for one in self._commands.items() if one[1][0] is worker]:
             del self._commands[number]
             command.reply_refusal("the process of the device has ended")
-        if status == 0 or self._stop.is_set():
+        if self._stop.is_set() or (status == 0 and worker.ended_generation == worker.generation):
+            return
+        if status == 0 or not worker.devices:  # the newest configuration came after the end of the process
+            worker.restart_s = time.monotonic() if worker.devices else None
             return
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         _log.error("worker", text=f"{worker.name} {how}; starting it again", devices=", ".join(worker.devices))
@@ -244,16 +251,19 @@ class WorkerSupervisor(DaemonProcess):
         return config_changes.compare_with_file(self.config, self._models)
 
     def _apply(self, change: ConfigChange) -> None:
+        for device in change.added:
+            if isinstance(device.link, VirtualTable):
+                from monitor.simulator.encoding_sensor import SimulatedSensor
+
+                SimulatedSensor(device.link, device.decoder, device.name)  # raises ConfigError for invalid settings
         self._adopt(change.config)
         self._models = {device.name: read_model_in_force(device) for device in change.config.devices}
         for name in change.removed:
             self._healths.pop(name, None)
-            if self._workers[self._places[name]].pipe is None:  # otherwise, the worker reports the removal
-                self._pass_on("remove_device", name)
-        self._distribute_devices()
+            self._pass_on("remove_device", name)
         for device in change.added:
-            if self._workers[self._places[device.name]].pipe is None:
-                self._pass_on("add_device", device)
+            self._pass_on("add_device", device)
+        self._distribute_devices()
 
     def _publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         memory = measure_memory_bytes() + sum(worker.memory_bytes for worker in self._workers)

@@ -29,11 +29,12 @@ from monitor.daemon.outputs.output import Output
 from monitor.daemon.service import Service
 from monitor.publishing.zenoh.publisher import Command
 from monitor.settings import loading
-from monitor.settings.loading import Config, Device
+from monitor.settings.loading import Config
 
 START: Final = "start"
 STOP: Final = "stop"
 RELOAD: Final = "reload"
+ENDED: Final = "ended"
 COMMAND: Final = "command"
 
 _log = structlog.get_logger("imu-monitor")
@@ -96,14 +97,6 @@ class PipeOutput(Output):
         """Send whether samples of a device arrive."""
         self.call("set_alive", device, samples_arrive)
 
-    def add_device(self, device: Device) -> None:
-        """Send the name of an added device."""
-        self.call("add_device", device.name)
-
-    def remove_device(self, device: str) -> None:
-        """Send the name of a removed device."""
-        self.call("remove_device", device)
-
 
 class _ProgressNotifier(SystemdNotifier):
     """Notifier that sends the progress of the readers to the main process, which notifies systemd."""
@@ -134,6 +127,8 @@ class WorkerService(Service):
         super().__init__(config, [output], unit=_ProgressNotifier(output), owner_pid=main_pid)
         self._output = output
         self._new_table: tuple[Any, ...] = ()  # arguments of the last call RELOAD
+        self.generation = 0
+        """Number of the newest applied configuration."""
 
     def receive_calls(self, connection: Connection) -> None:
         """Execute calls from the main process until it requests a stop or exits."""
@@ -151,12 +146,15 @@ class WorkerService(Service):
             reply, refuse = (partial(self._output.call, name, number) for name in ("reply_result", "reply_refusal"))
             self.zenoh.commands.put(Command(device, verb, reply, refuse))
 
-    def _reload(self) -> None:
+    def _begin_reload(self) -> None:
+        table, folder, self.generation = self._new_table
         try:
-            new, models = loading.load_selected_devices(*self._new_table), {one.name: one.model for one in self.workers}
+            new, models = loading.load_selected_devices(table, folder), {one.name: one.model for one in self.workers}
             self._apply(compare_configurations(self.config, new, models))
-        except ConfigError as error:  # the main process has not checked simulated sensors
+        except ConfigError as error:  # for example, a file has been deleted since the main process read it
             _log.error("not reloaded, the running configuration stays in force", error=str(error))
+        for name, samples_arrive in self._alive.items():  # the main process may have removed and added a device
+            self._output.set_alive(name, samples_arrive)
 
 
 def run_worker(descriptor: int) -> NoReturn:
@@ -190,6 +188,7 @@ def _run_service(
     service = WorkerService(config, output, main_pid)
     threading.Thread(target=service.receive_calls, args=(connection,), name="calls", daemon=True).start()
     service.run()
+    output.call(ENDED, service.generation)
 
 
 def _send_log_lines(output: PipeOutput) -> None:
