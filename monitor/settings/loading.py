@@ -57,6 +57,9 @@ __all__ = [
     "parse_rate_as_period",
 ]
 
+MAX_DEVICES: Final = 1000
+"""Maximum number of devices of one daemon."""
+MAX_HOOKS: Final = 1000
 DEVICE_PLACE: Final = re.compile(r"device\[(\d+)\]\.?(.*)")
 
 
@@ -148,6 +151,8 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
     except ConfigError as error:
         hint = "" if path.suffix in ("", ".toml") else "; imu-monitor analyze reads recordings"
         return ConfigReading(None, [f"{path}: {error}{hint}"])
+    if line := _explain_too_many_tables(table):
+        return ConfigReading(None, [f"{path}: {line}"])
     checked = check_table(ConfigFile, table, path.resolve().parent)
     warnings = [*_check_zenoh_file(checked), *_check_token_file(checked), *_find_reflections(checked)]
     wrong = [_format_problem(problem, table) for problem in checked.problems]
@@ -161,6 +166,15 @@ def examine_config_file(path: Path, *, allow_pipe: bool = False) -> ConfigReadin
     config = _configuration(checked.value)
     lines = tuple(f"{path}: {line}" for line in warnings)
     return ConfigReading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
+
+
+def _explain_too_many_tables(table: Mapping[str, Any]) -> str:
+    """Return a message if an array of tables is too long to be checked and run by one process, or ""."""
+    for key, limit in (("device", MAX_DEVICES), ("hook", MAX_HOOKS)):
+        entries = table.get(key)
+        if isinstance(entries, list) and len(entries) > limit:
+            return f"{key}: {len(entries)} tables; at most {limit} are supported; use several daemons"
+    return ""
 
 
 def select_devices(config: Config, names: Collection[str]) -> tuple[dict[str, Any], Path]:

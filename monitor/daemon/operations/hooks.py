@@ -1,8 +1,11 @@
 """Hooks: user commands and zenoh messages that are triggered by events.
 
 An event that matches a hook is encoded as JSON. The JSON is published on the zenoh key of the hook, or passed to the
-standard input of a command. Commands wait in a bounded queue and run in a few threads, without a shell. A command that
-exceeds the time limit is killed together with all child processes. The status shows the error of the newest run.
+standard input of a command. Commands wait in a bounded queue and run in a few threads, without a shell. The time limit
+applies to the command and to all processes that it has started, which are then killed. On Linux, these processes are
+found in ``/proc`` by their parents and by a variable in their environment, so that a process in a session of its own is
+killed as well. On other systems, only the process group of the command is killed. The status shows the error of the
+newest run.
 
 For each kind of event and each device, a hook runs at most BURST times in a row and then once in RUN_INTERVAL_S. A
 faulty cable that reports losses every second therefore starts only a few programs.
@@ -11,6 +14,7 @@ faulty cable that reports losses every second therefore starts only a few progra
 import contextlib
 import os
 import queue
+import secrets
 import select
 import signal
 import subprocess
@@ -25,6 +29,7 @@ import structlog
 
 from drivers.data_types import Event
 from drivers.secret_masking import mask_secrets
+from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.daemon.outputs.output import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
@@ -43,6 +48,12 @@ MAX_LINE_CHARS: Final = 200
 """Maximum length of an output line in a message, in characters."""
 MAX_LAST_READS: Final = 16
 """Maximum number of reads of the output after a command has ended."""
+CHILD_POLL_S: Final = 0.5
+"""Interval between two checks of whether the processes that a command has started have ended."""
+MAX_KILL_ROUNDS: Final = 20
+"""Maximum number of searches for processes to kill, which may start further processes in the meantime."""
+RUN_VARIABLE: Final = "IMU_MONITOR_HOOK_RUN"
+"""Environment variable that identifies the processes of one run of a command."""
 POLL_S: Final = 0.05
 """Interval between two checks of whether a command has ended."""
 CLOSE_TIMEOUT_S: Final = 2.0
@@ -72,6 +83,8 @@ class Hooks(Output):
     now : callable, optional
         Monotonic clock in seconds.
     """
+
+    name = "hook"
 
     def __init__(
         self, hooks: Sequence[Hook], put: Callable[[str, bytes], str], now: Callable[[], float] = time.monotonic
@@ -153,7 +166,11 @@ class Hooks(Output):
 
     def _run_queued(self) -> None:
         while not self._closing.is_set() and (job := self._jobs.get()) is not None:
-            self._log_result(job.hook.command[0], _run_command(job.hook, job.payload, job.named, self._closing.is_set))
+            try:
+                wrong = _run_command(job.hook, job.payload, job.named, self._closing.is_set)
+            except Exception as error:  # noqa: BLE001 - the status shows the error, and other commands are still run
+                wrong = log_unexpected_error("hook", error)
+            self._log_result(job.hook.command[0], wrong)
 
     def _log_result(self, what: str, wrong: str) -> None:
         if wrong:
@@ -171,13 +188,14 @@ def _matches(hook: Hook, device: str, kind: str) -> bool:
 def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
     """Run the command of a hook, and return "" or a description of the error."""
     environment = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
+    run = secrets.token_hex(8)
     try:
         process = subprocess.Popen(
             hook.command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**environment, **named},
+            env={**environment, **named, RUN_VARIABLE: run},
             start_new_session=True,  # so that all child processes can be killed
         )
     except (OSError, ValueError) as error:
@@ -188,11 +206,15 @@ def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: C
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:  # the command may close its standard input
                 process.stdin.write(payload)  # does not block, because a pipe buffers more bytes
-            return _wait_for_end(process, output.fileno(), hook.timeout_s, ending)
+            until_s = time.monotonic() + hook.timeout_s
+            wrong = _wait_for_end(process, output.fileno(), hook.timeout_s, ending)
+            while not wrong and find_processes_of_run(run):
+                if ending() or time.monotonic() > until_s:
+                    return "" if ending() else f"its child processes were killed after {hook.timeout_s:g} s"
+                time.sleep(CHILD_POLL_S)
+            return wrong
         finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)  # the process id is valid, because the process is not reaped
-                process.wait()
+            _kill_run(process, run)
 
 
 def _wait_for_end(process: "subprocess.Popen[bytes]", output: int, timeout_s: float, ending: Callable[[], bool]) -> str:
@@ -219,6 +241,42 @@ def _wait_for_end(process: "subprocess.Popen[bytes]", output: int, timeout_s: fl
     lines = tail.decode("utf-8", "replace").strip().splitlines()
     last = "".join(letter if letter.isprintable() else "�" for letter in mask_secrets(lines[-1])) if lines else ""
     return f"{how}: {last[-MAX_LINE_CHARS:]}" if last else how
+
+
+def _kill_run(process: "subprocess.Popen[bytes]", run: str) -> None:
+    """Kill a command and all processes that it has started."""
+    pids = find_processes_of_run(run)  # searched before the parents of the processes are killed
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)  # the process id is valid, because the process is not reaped
+    for _ in range(MAX_KILL_ROUNDS):
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+        process.wait()
+        pids = find_processes_of_run(run)
+        if not pids:
+            return
+
+
+def find_processes_of_run(run: str) -> set[int]:
+    """Return the process ids of a run, which are processes with the variable of the run and their child processes.
+
+    Parameters
+    ----------
+    run : str
+        Value of RUN_VARIABLE in the environment of the command.
+    """
+    mark = f"{RUN_VARIABLE}={run}".encode()
+    found: set[int] = set()
+    parents: dict[int, int] = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # the process has ended, or belongs to another user
+            parents[int(path.name)] = int((path / "stat").read_text("utf-8", "replace").rpartition(")")[2].split()[1])
+            if mark in (path / "environ").read_bytes().split(b"\0"):
+                found.add(int(path.name))
+    while more := {pid for pid, parent in parents.items() if parent in found} - found:
+        found |= more
+    return found
 
 
 def _read(output: int) -> bytes:

@@ -4,14 +4,17 @@ The main loop stores the newest status and estimate of each device. A server thr
 values, so a scrape does not delay the main loop. If the port is in use, the server tries again.
 """
 
+import contextlib
 import socket
 import socketserver
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.host.extras import install_command
+from monitor.common.unexpected_errors import RestartedThread
 from monitor.daemon.outputs.newest_metrics import NewestMetrics
 from monitor.settings.loading import MetricsAddress
 
@@ -23,8 +26,8 @@ RETRY_S: Final = 5.0
 """Interval between two attempts to listen."""
 TIMEOUT_S: Final = 10.0
 """Maximum duration of a scrape."""
-MAX_SCRAPES: Final = 8
-"""Maximum number of concurrent scrapes."""
+MAX_CONNECTIONS: Final = 64
+"""Maximum number of open connections. A further connection ends the oldest one, which is slower than any scrape."""
 PAUSE_S: Final = 0.1
 """Pause after a failed connection."""
 PATH: Final = "/metrics"
@@ -42,15 +45,22 @@ class MetricsOutput(NewestMetrics):
         Address of the server. Port 0 selects a free port.
     """
 
+    name = "metrics"
+
     def __init__(self, settings: MetricsAddress) -> None:
         super().__init__()
         self._settings = settings
-        self.state = "starting"
+        self._state = "starting"
         self.port = 0
         """Port of the server, or 0 while the server does not listen."""
         self._server: _Server | None = None
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="metrics", daemon=True)
+        self._thread = RestartedThread(self._run, "metrics", self._closing)
+
+    @property
+    def state(self) -> str:
+        """Status message: ``ok``, or a description of the problem."""
+        return self._thread.failure or self._state
 
     def start(self) -> None:
         """Start the server in a thread."""
@@ -84,7 +94,7 @@ class MetricsOutput(NewestMetrics):
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
-            self.state = MISSING_LIBRARY_TEXT
+            self._state = MISSING_LIBRARY_TEXT
             return
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
@@ -93,18 +103,18 @@ class MetricsOutput(NewestMetrics):
                 server = _Server((self._settings.host, self._settings.port), registry)
             except (OSError, UnicodeError) as error:
                 where = f"{self._settings.host}:{self._settings.port}"
-                self.state = f"{where}: {getattr(error, 'strerror', None) or error}; trying again"
+                self._state = f"{where}: {getattr(error, 'strerror', None) or error}; trying again"
                 self._closing.wait(RETRY_S)
                 continue
             with server:
-                self._server, self.port, self.state = server, int(server.server_address[1]), "ok"
+                self._server, self.port, self._state = server, int(server.server_address[1]), "ok"
                 if not self._closing.is_set():
                     server.serve_forever()
             self.port = 0
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Server with one thread per scrape.
+    """Server with one thread per connection.
 
     The server class of http.server is not used, because it queries the network for the name of the host.
     """
@@ -114,7 +124,8 @@ class _Server(socketserver.ThreadingTCPServer):
     block_on_close = False
 
     def __init__(self, address: tuple[str, int], registry: "CollectorRegistry") -> None:
-        self._free = threading.Semaphore(MAX_SCRAPES)
+        self._open: deque[socket.socket] = deque()  # oldest first
+        self._lock = threading.Lock()  # protects ``_open``
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         super().__init__(address, _make_handler(registry))
@@ -128,14 +139,16 @@ class _Server(socketserver.ThreadingTCPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Start a thread for a scrape, or reject the scrape if too many scrapes are active."""
-        if not self._free.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
+        """Start a thread for a connection, and end the oldest connection if too many connections are open."""
+        with self._lock:
+            self._open.append(request)
+            if len(self._open) > MAX_CONNECTIONS:
+                with contextlib.suppress(OSError):  # the client has closed the connection
+                    self._open.popleft().shutdown(socket.SHUT_RDWR)  # its thread then ends
         try:
             super().process_request(request, client_address)
         except RuntimeError:  # the system allows no more threads
-            self._free.release()
+            self._forget(request)
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -143,7 +156,11 @@ class _Server(socketserver.ThreadingTCPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._forget(request)
+
+    def _forget(self, request: socket.socket) -> None:
+        with self._lock, contextlib.suppress(ValueError):  # the connection has been ended
+            self._open.remove(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore errors from connections that the client has closed."""

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -131,6 +132,40 @@ def test_command_beyond_its_time_limit_is_killed_with_its_children(tmp_path: Pat
             break
     pid = int(child.read_text())
     wait_for(lambda: not is_running(pid))
+
+
+ESCAPES = {
+    "session": "if not os.fork(): os.setsid(); run()\ntime.sleep(1e6)",
+    "session of an ended parent": "if not os.fork():\n os.setsid()\n if not os.fork(): run()\n os._exit(0)\n"
+    "time.sleep(1e6)",
+    "command that has ended": "if not os.fork(): os.setsid(); run()",
+    "other environment": "if not os.fork(): os.setsid(); os.execve(sys.executable, [sys.executable, '-c', again], {})\n"
+    "time.sleep(1e6)",
+}  # fmt: skip
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs /proc")
+@pytest.mark.parametrize("escape", ESCAPES.values(), ids=ESCAPES)
+@pytest.mark.parametrize("ending", ["time limit", "end of the service"])
+def test_process_in_a_session_of_its_own_is_killed_with_the_command(tmp_path: Path, escape: str, ending: str) -> None:
+    mark = tmp_path / "pid"
+    again = f"import os, time; open({str(mark)!r}, 'w').write(str(os.getpid())); time.sleep(1e6)"
+    text = f"import sys\nagain = {again!r}\ndef run():\n for fd in range(3): os.close(fd)\n exec(again)\n{escape}"
+    for timeout_s in (2.0, 8.0, 32.0) if ending == "time limit" else (FOREVER_S,):
+        running = RunningHooks(make_hook(write_program(tmp_path, text), timeout_s=timeout_s))
+        running.raise_event()
+        if ending == "time limit":
+            wait_for(partial(says_killed, running, timeout_s))
+        else:
+            wait_for(lambda: mark.exists() and mark.read_text() != "")
+        running.hooks.close()
+        if mark.exists():
+            break
+    wait_for(lambda: not is_running(int(mark.read_text())))
+
+
+def says_killed(running: RunningHooks, timeout_s: float) -> bool:
+    return f"killed after {timeout_s:g} s" in running.hooks.state
 
 
 def is_running(pid: int) -> bool:
