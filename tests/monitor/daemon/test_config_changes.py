@@ -221,6 +221,31 @@ def test_new_limits_and_hooks_take_effect_and_an_invalid_file_does_not(tmp_path:
     assert "not TOML" in wrong[0]["error"]
 
 
+def test_reading_the_file_delays_neither_samples_nor_the_end_of_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(format_device("a") + QUIET)
+    reading, release = threading.Event(), threading.Event()
+
+    def read_slowly(_path: Path) -> loading.Config:
+        reading.set()
+        release.wait(PATIENCE_S)
+        raise ConfigError("read slowly")
+
+    try:
+        with run_service(path) as service:
+            (worker,) = service.workers
+            monkeypatch.setattr(loading, "load_config", read_slowly)
+            service.request_reload()
+            wait_for(reading.is_set)
+            received = worker.driver.counts.received
+            wait_for(lambda: worker.publisher.published > received + 100)
+        assert not release.is_set()  # the service has ended in the meantime
+    finally:
+        release.set()
+
+
 @pytest.mark.long
 def test_sighup_reloads_the_configuration_and_notifies_systemd(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"

@@ -14,6 +14,8 @@ from drivers.validation import module_lookup
 from monitor.common.shipped_config_paths import CONFIG_FOLDER, resolve_model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
+    MAX_DEVICES,
+    MAX_HOOKS,
     WINDOW_SAMPLES,
     VirtualTable,
     check_viewer_mode,
@@ -689,6 +691,25 @@ def test_viewer_history_needs_stored_history(tmp_path):
     path.write_text(format_device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\nhistory = false\n')
     with pytest.raises(ConfigError, match="there is no history to show"):
         load_config(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[[device]]\nname = "a"\n' * (MAX_DEVICES + 1), "device: 1001 tables; at most 1000 are supported"),
+        ("[[hook]]\n" * (MAX_HOOKS + 1), "hook: 1001 tables; at most 1000 are supported"),
+        (f"[{'.'.join('a' * 500)}]\nx = 1\n", "nested too deep, at most 64 levels"),
+        (f"{'.'.join('a' * 20_000)} = 1\n", "nested too deep, at most 64 levels"),
+        (" . ".join(['"a"'] * 20_000) + " = 1\n", "nested too deep, at most 64 levels"),
+        (f"x = {'[' * 200}{']' * 200}\n", "nested too deep, at most 64 levels"),
+    ],
+    ids=["devices", "hooks", "tables", "dotted key", "quoted key", "arrays"],
+)
+def test_configuration_that_is_too_large_is_refused(tmp_path, text, message):
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    (line,) = examine_config_file(path).wrong
+    assert message in line
 
 
 def test_viewer_mode_is_checked():
