@@ -4,14 +4,15 @@ The variance of each axis is monitored separately at averaging times of 1, 2, 4,
 The reference variance of an octave is learned from the samples since the last change. A ``Change`` describes a noise
 change, a bias step or a burst of outliers.
 
-- **False alarms.** Of the accepted false alarms, 80 % are assigned to noise changes, 10 % to bias steps and 10 % to
-  bursts. The threshold for noise changes is h = ln(tests per day · RATE_AT_ZERO / alarms per day). The constant
-  ``RATE_AT_ZERO`` was measured at thresholds of 8 to 12 (``tests/experiments/benchmarks/changes.py``). Typical
-  thresholds are 13 to 20.
-- **Learning.** An octave can raise an alarm when its reference is older than ``LEARN_S`` and contains
-  ``MIN_REFERENCE_TERMS`` differences. Short octaves learn for one minute, and long octaves learn for 128 clusters.
-  Changes during the learning time are not detected. A slow drift of the noise is eventually reported as a change,
-  because the reference contains all samples since the last change.
+- **False alarms.** Of the accepted false alarms, 70 % are assigned to noise changes, and 10 % each to bias steps,
+  bursts and spectral lines (``line_onset_detection``). The threshold for noise changes is h = ln(tests per day ·
+  RATE_AT_ZERO / alarms per day). The constant ``RATE_AT_ZERO`` was measured at thresholds of 8 to 12
+  (``tests/experiments/benchmarks/changes.py``). Typical thresholds are 13 to 20.
+- **Learning.** An octave can raise an alarm when its reference is older than ``NOISE_LEARN_S`` and contains
+  ``MIN_REFERENCE_TERMS`` differences. Short octaves learn for eight seconds, and long octaves learn for 128 clusters.
+  During the first ``LEARN_S`` seconds, the threshold is higher. Changes during the learning time are not detected. A
+  slow drift of the noise is eventually reported as a change, because the reference contains all samples since the last
+  change.
 - **After a change**, the samples since the change become the new reference.
 - **Bursts.** A burst of outliers increases the number of large differences between samples, but not the median
   difference. Samples in a burst are removed from the reference.
@@ -67,6 +68,7 @@ from monitor.estimation.detection.changed_coefficient_identification import (
     HaarVariancesBeforeAfter,
     identify_changed_coefficients,
 )
+from monitor.estimation.detection.line_onset_detection import LineChange, LineOnsetDetector
 
 MAX_CLUSTER_S: Final = 300.0
 """Maximum cluster length in seconds.
@@ -74,7 +76,9 @@ MAX_CLUSTER_S: Final = 300.0
 Longer clusters would need days of learning and would respond to changes of the temperature.
 """
 LEARN_S: Final = 60.0
-"""Minimum learning time in seconds. Spectral lines with a width of 1/``LEARN_S`` are resolved in this time."""
+"""Minimum learning time in seconds before a bias step or a burst of outliers."""
+NOISE_LEARN_S: Final = 8.0
+"""Minimum learning time in seconds before a noise change."""
 MIN_DWELL_SAMPLES: Final = 256
 """Minimum number of samples between an alarm and the decision about its cause."""
 MAX_DWELL_S: Final = 60.0
@@ -86,10 +90,10 @@ RATE_AT_ZERO: Final = 0.07
 
 The measured values are 0.053 to 0.065 (``tests/experiments/benchmarks/changes.py``).
 """
-NOISE_SHARE: Final = 0.8
+NOISE_SHARE: Final = 0.7
 """Share of the accepted false alarms that is assigned to noise changes."""
 OTHER_SHARE: Final = 0.1
-"""Share of the accepted false alarms that is assigned to bias steps, and likewise to bursts of outliers."""
+"""Share of the accepted false alarms that is assigned to bias steps, to bursts of outliers and to spectral lines."""
 SKIP_BLOCK_ROWS: Final = 4096
 """Maximum number of missing samples that are processed at a time."""
 MAX_CLIPPED_RATIO: Final = 4.0
@@ -157,8 +161,10 @@ class NoiseAndBiasChangeDetector:
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
             max(log(looks / TICK_SAMPLES / (OTHER_SHARE * alarms_per_day)), 1.0),
-            once, MIN_DWELL_SAMPLES, max(MAX_DWELL_S * rate_hz, MIN_DWELL_SAMPLES), LEARN_S * rate_hz,
+            once, MIN_DWELL_SAMPLES, max(MAX_DWELL_S * rate_hz, MIN_DWELL_SAMPLES),
+            LEARN_S * rate_hz, NOISE_LEARN_S * rate_hz,
         )  # fmt: skip
+        self._lines = LineOnsetDetector(rate_hz, OTHER_SHARE * alarms_per_day)
         self._found: list[Change] = []
 
     @property
@@ -182,15 +188,18 @@ class NoiseAndBiasChangeDetector:
         rows = as_read_only(np.ascontiguousarray(values, np.float64))
         if rows.ndim != 2 or rows.shape[1] != len(AXES):
             raise ValueError(f"samples of shape {rows.shape}; expected is [n, {len(AXES)}]")
-        row = 0
+        row, lines = 0, self._lines
         while row < len(rows):
-            row = advance_until_decision(self._state, rows, row)
+            begin, row = row, advance_until_decision(self._state, rows[: row + lines.samples_to_segment_end], row)
+            lines.append_samples(rows[begin:row])
             if self._state.clock[TOTAL] >= self._state.clock[NEXT_DUE]:
                 for axis in np.flatnonzero(
                     (self._state.alarm[:, KIND] > 0) & (self._state.alarm[:, DUE] <= self.samples_since_start)
                 ):
                     self._decide(int(axis))
                 set_next_decision_sample(self._state)
+            for line in lines.take_changes():
+                self._report_line(line, self.samples_since_start - line.age, self.samples_since_start, line.evidence)
 
     def skip_missing_samples(self, n_samples: int) -> None:
         """Process the given number of missing samples."""
@@ -209,6 +218,10 @@ class NoiseAndBiasChangeDetector:
         s.alarm[axis] = 0.0
         if alarm[KIND] == STEP:
             self._report_step(axis, alarm)
+            return
+        line = self._lines.identify_change(axis, self.samples_since_start - int(alarm[START]))
+        if line is not None:
+            self._report_line(line, int(alarm[START]), int(alarm[FOUND]), float(alarm[EVIDENCE]))
             return
         after = s.cum[axis] - self._cum_at(int(alarm[START]))[axis]  # [J, 5]
         n, total = s.band[axis, :, N], s.band[axis, :, S]
@@ -264,6 +277,17 @@ class NoiseAndBiasChangeDetector:
         band[keep, N], band[keep, S] = after[keep, UNIT_N], after[keep, UNIT_N] * v1[keep]
         band[keep, LIMIT], band[keep, SEEDED] = CLIP * v1[keep], SEED
 
+    def _report_line(self, line: LineChange, since: int, found: int, evidence: float) -> None:
+        axis = AXES[line.axis]
+        what = {"amplitude": (line.before, line.after), "frequency": (line.frequency_hz, line.frequency_hz)}
+        amplitude = format_axis_value(axis, line.after or line.before)
+        change = {0.0: "began, amplitude "}.get(line.before, "ended, amplitude before " if not line.after else "")
+        text = f"{axis} line at {line.frequency_hz:.3g} Hz {change or _format_change(line.before, line.after)}"
+        text += amplitude if change else f", amplitude {amplitude}"
+        since = max(since, int(self._state.born[line.axis]))
+        self._found.append(Change("noise_changed", line.axis, since, found, sqrt(2.0 * evidence), what, text))
+        self._restart_reference(line.axis, since)
+
     def _report_burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
         s = self._state
         now = self.samples_since_start
@@ -314,6 +338,7 @@ class NoiseAndBiasChangeDetector:
         s.band[axis] = s.spread[axis] = 0.0
         s.band[axis, :, F] = 1.0
         s.alarm[axis] = 0.0
+        self._lines.restart(axis)
         self._clear_suspicion(axis)
 
 
@@ -333,6 +358,9 @@ def _format_change(before: float, after: float) -> str:
         return "appeared"
     if after == 0.0:
         return "vanished"
-    percent = 100.0 * (after / before - 1.0)
+    ratio = after / before
+    if not 0.5 < ratio < 2.0:
+        return f"rose by a factor of {ratio:.3g}" if ratio > 1.0 else f"fell by a factor of {1.0 / ratio:.3g}"
+    percent = 100.0 * (ratio - 1.0)
     digits = 0 if abs(percent) >= 9.5 else 1
     return f"{'rose' if percent > 0 else 'fell'} by {abs(percent):.{digits}f} %"

@@ -64,6 +64,11 @@ MIN_REFERENCE_TERMS: Final = 64
 The number is multiplied by F². The first factor F accounts for the reduced information in correlated squares. The
 second factor F ensures that the observed sums are much longer than the correlation time.
 """
+YOUNG_EVIDENCE: Final = 1.5
+"""Factor on the threshold of noise changes while the reference is younger than the learning time.
+
+Noise that is modulated over half a minute has not yet increased the factor F in this time.
+"""
 MIN_BAND_TERMS: Final = 16
 """Minimum number of squared differences in a longer octave from which slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8
@@ -93,14 +98,14 @@ BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
 """Columns of ``ChangeState.step``, in which column 0 is the octave."""
 TOTAL, NEXT_DUE = 0, 1
 """Elements of ``ChangeState.clock``, which are sample numbers."""
-H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME = range(6)
+H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME, NOISE_LEARN_TIME = range(7)
 """Elements of ``ChangeState.levels``, which are thresholds and times in samples."""
 
 
 class ChangeState(NamedTuple):
     """State of the change detector for A = 6 axes, J octaves and L = 12 levels of sums."""
 
-    levels: Floats  # [6] thresholds, and times in samples, at the indices from H_NOISE to LEARN_TIME
+    levels: Floats  # [7] thresholds, and times in samples, at the indices from H_NOISE to NOISE_LEARN_TIME
     clock: Ints  # [2] number of samples since the start, and sample number of the next decision
     born: Ints  # [A] first sample of the reference
     stage: Floats  # [A, 32] samples of the current tick
@@ -126,7 +131,7 @@ def make_change_state(octaves: int) -> ChangeState:
     """Return the initial state of the change detector. The caller must set ``levels``."""
     a, j = AXES, octaves
     state = ChangeState(
-        np.zeros(6), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
+        np.zeros(7), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
         np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
@@ -182,7 +187,7 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
     h = s.levels[H_NOISE]
     for j in range(SHORT):
         _differences(sums, s.band, s.unit, s.seeds, axis, j)
-        best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, axis, j, now, h)
+        best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, s.alarm, axis, j, now, h)
         if best >= 0:
             _suspect(s, axis, j, best, now)
     place = now // TICK_SAMPLES - 1
@@ -193,7 +198,7 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
         place >>= 1
         if s.fill[axis, j] >= 0:
             _pair(s, axis, j, s.half[axis, j, 0], s.half[axis, j, 1], total, count, now)
-            best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, axis, j, now, h)
+            best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, s.alarm, axis, j, now, h)
             if best >= 0:
                 _suspect(s, axis, j, best, now)
         else:
@@ -302,11 +307,21 @@ def _median_of_seeds(first: Floats) -> float:
 
 @compiled
 def _look(
-    unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
+    unit: Floats,
+    cum: Floats,
+    band: Floats,
+    spread: Floats,
+    cusum: Floats,
+    alarm: Floats,
+    axis: int,
+    j: int,
+    now: int,
+    h: float,
 ) -> int:
     """Add the new squared Haar differences of one octave to the reference and to the evidence.
 
-    Return the index of the variance ratio with the largest evidence if the evidence exceeds the threshold h, else −1.
+    Differences after a change do not count towards the factor F. Return the index of the variance ratio with the
+    largest evidence if the evidence exceeds the threshold h, else −1.
     """
     k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
     if k == 0.0:
@@ -319,9 +334,10 @@ def _look(
     band[axis, j, S] += q
     if unsettled and band[axis, j, N] >= SETTLED:
         band[axis, j, LIMIT] = CLIP * band[axis, j, S] / band[axis, j, N]
-    if k == max(1, TICK_SAMPLES >> (j + 1)):
+    best = _raise_cusums(cusum, band, axis, j, k, q, now, h)
+    if best < 0 and alarm[axis, KIND] == 0.0 and k == max(1, TICK_SAMPLES >> (j + 1)):
         _feed_spread(spread, band, axis, j, q, k)
-    return _raise_cusums(cusum, band, axis, j, k, q, now, h)
+    return best
 
 
 @compiled
@@ -385,8 +401,10 @@ def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
     """Raise an alarm for a noise change, or restart the reference if it is too short."""
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
-    if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
-        _alarm(s, axis, NOISE, since, s.cusum[axis, j, i, G], now)
+    age, evidence = since - s.born[axis], s.cusum[axis, j, i, G]
+    if enough and age >= s.levels[NOISE_LEARN_TIME]:
+        if age >= s.levels[LEARN_TIME] or evidence > YOUNG_EVIDENCE * s.levels[H_NOISE]:
+            _alarm(s, axis, NOISE, since, evidence, now)
     elif s.alarm[axis, KIND] == 0.0:
         _relearn(s, axis, j)
 

@@ -4,7 +4,7 @@ Motion and noise changes are reported as events. After a noise change, the monit
 the old samples of the axis. The change detector ignores samples in motion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from drivers.data_types import AXES, Event, SampleBlock
@@ -119,6 +119,7 @@ class MotionAndChangeMonitor:
         self._began = self._received
         self._rest = MotionDetector(self._rate_hz)
         self._first = 0  # index of the first sample that the change detector received, relative to ``_began``
+        self._louder: MotionEpisode | None = None  # newest rise of the noise that the change detector received masked
         self._changes = (
             NoiseAndBiasChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
         )
@@ -130,9 +131,12 @@ class MotionAndChangeMonitor:
     def _search(self, still: list[SampleBlock]) -> None:
         if self._keep_samples_at_rest:
             self._still += still
-        motions = self._rest.take_motions()
-        self.orientation_changes += sum(motion.kind == "handling/orientation" for motion in motions)
-        self._events += [self._motion_event(motion) for motion in motions]
+        for motion in self._rest.take_motions():
+            if motion.kind == "noise":
+                self._louder = motion
+                continue
+            self.orientation_changes += motion.kind == "handling/orientation"
+            self._events.append(self._motion_event(motion))
         if self._changes is None:
             return
         for samples in still:
@@ -147,6 +151,9 @@ class MotionAndChangeMonitor:
 
     def _report_changes(self, changes: NoiseAndBiasChangeDetector) -> None:
         for change in changes.take_changes():
+            louder, since = self._louder, self._first + change.since
+            if change.kind == "noise_changed" and louder and louder.since <= since <= louder.until + self._rate_hz:
+                change = replace(change, since=max(louder.since - self._first, 0))
             self._events.append(self._change_event(change))
             if change.kind == "noise_changed":
                 handed_on = (

@@ -21,11 +21,13 @@ from monitor.common.unit_formatting import format_axis_value
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
     BEGAN,
-    CHANGED,
     FIRST,
+    KIND,
     LAST,
+    MOTION,
     PEAK,
     REMOVED_AFTER,
+    TURN,
     MotionState,
     advance_motion_detection,
     make_motion_state,
@@ -38,14 +40,14 @@ MIN_BLOCK_SAMPLES: Final = 8
 MAX_KNOCK_BLOCKS: Final = 2
 """Maximum number of moving blocks in an episode that counts as a knock, if the orientation does not change."""
 
-Kind = Literal["knock", "motion", "handling/orientation"]
+Kind = Literal["knock", "motion", "handling/orientation", "noise"]
 
 
 @dataclass(frozen=True, slots=True)
 class MotionEpisode:
-    """Detected episode of motion."""
+    """Detected episode of motion, or of noise that is not motion."""
 
-    kind: Kind
+    kind: Kind  # "noise" if the noise level rose and the sensor did not move
     since: int  # index of the first replaced sample, counting missing samples
     until: int  # index after the last replaced sample
     seconds: float  # duration of the motion in seconds
@@ -146,7 +148,13 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
     size = samples_per_block(rate_hz)
     _, moving, episodes = _decide_blocks(_read_only(values), 0, size, True, make_motion_state())
     mask = np.repeat(moving.astype(bool), size)[: len(values)]
-    return mask, [_make_motion(episode, size, rate_hz) for episode in episodes]
+    motions = []
+    for motion in (_make_motion(episode, size, rate_hz) for episode in episodes):
+        if motion.kind == "noise":
+            mask[motion.since : motion.until] = False
+        else:
+            motions.append(motion)
+    return mask, motions
 
 
 def samples_per_block(rate_hz: float) -> int:
@@ -179,10 +187,14 @@ def _make_motion(episode: Floats, size: int, rate_hz: float) -> MotionEpisode:
     axis, peak = AXES[int(episode[AXIS])], float(episode[PEAK])
     moving = last - first + 1
     seconds = moving * size / rate_hz
-    kind: Kind = "handling/orientation" if episode[CHANGED] else "knock" if moving <= MAX_KNOCK_BLOCKS else "motion"
-    size_text = f"{axis} up to {format_axis_value(axis, peak)}"
-    verb = {"knock": "knocked", "motion": "moved", "handling/orientation": "handled, and left in another orientation,"}
-    text = f"{verb[kind]} for {seconds:.1f} s: {size_text}"
-    if kind == "knock":
-        text = f"knocked: {size_text}"
+    kind: Kind = "knock" if moving <= MAX_KNOCK_BLOCKS else "motion"
+    if episode[KIND] != MOTION:
+        kind = "handling/orientation" if episode[KIND] == TURN else "noise"
+    verb = {
+        "knock": "knocked",
+        "motion": f"moved for {seconds:.1f} s",
+        "handling/orientation": f"handled, and left in another orientation, for {seconds:.1f} s",
+        "noise": f"louder for {seconds:.1f} s",
+    }
+    text = f"{verb[kind]}: {axis} up to {format_axis_value(axis, peak)}"
     return MotionEpisode(kind, max(first - 1, 0) * size, (last + 1 + REMOVED_AFTER) * size, seconds, axis, peak, text)

@@ -10,6 +10,9 @@ If the mean stays constant at a new value, the orientation has changed, and the 
 stays constant becomes the new reference. A much smaller variance also starts a new reference, because the old reference
 must have been learned in motion.
 
+A step of the noise level is not motion. If the signal has been stationary with zero mean since the beginning of an
+episode, the episode is marked as ``NOISE``, and its blocks become the new reference.
+
 The index of a sample determines its block, so decisions do not depend on how the samples are distributed over calls.
 """
 
@@ -72,6 +75,24 @@ REMOVED_AFTER: Final = 2
 """Number of blocks that are replaced after a moving block."""
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode of motion."""
+GROUP_BLOCKS: Final = 4
+"""Number of blocks in a group, over which the stationarity of an episode is tested.
+
+A sinusoid above 2 Hz has nearly the same mean and variance in all groups.
+"""
+MIN_NOISE_BLOCKS: Final = 16
+"""Minimum number of stationary blocks (4 s) that distinguish a step of the noise level from motion.
+
+If the rise exceeds ``LARGE_RISE``, twice the number is needed.
+"""
+LARGE_RISE: Final = log(400.0)
+"""Increase of the log variance that is more likely a vibration of a few seconds than a step of the noise level."""
+MAX_NOISE_BLOCKS: Final = 40
+"""Maximum number of blocks (10 s) after which an episode can still turn out to be a step of the noise level."""
+GROUP_SIGMA: Final = 3.0
+"""Maximum deviation of the mean or log variance of a group from the average, in standard deviations of white noise."""
+MIN_GROUP_SCATTER: Final = 0.3
+"""Deviation of the log variance of a group that is always accepted, because real noise fluctuates more than χ²."""
 LOOK_EVERY: Final = 20
 """Number of blocks after which the detector tests again whether a disturbance is constant."""
 WANDER: Final = 4.0
@@ -91,10 +112,12 @@ OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED =
 - ``STILL``: number of successive blocks with a constant mean.
 - ``QUIET``: number of successive blocks with a far smaller variance than the reference.
 - ``RECENT``: total number of blocks.
-- ``TURNED``: 1 if the orientation changed in the current episode.
+- ``TURNED``: kind of the current episode, ``MOTION`` or ``TURN``.
 """
-FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
-"""Columns of an episode: first and last moving block, change of the orientation, axis of the peak, size of the peak."""
+FIRST, LAST, KIND, AXIS, PEAK = range(5)
+"""Columns of an episode: first and last moving block, kind, axis of the peak, size of the peak."""
+MOTION, TURN, NOISE = range(3)
+"""Kinds of episodes: motion, motion that changed the orientation, step of the noise level."""
 LOG_VARIANCE, MEAN = 0, 1
 """Indices of the block statistics in the first dimension of the ring buffers."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
@@ -163,7 +186,7 @@ def advance_motion_detection(
     blocks, moving : ndarray of int64, shape (at least n/size + 2,)
         Output arrays for the number of each decided block, and for the decision, which is 1 for motion.
     episodes : ndarray of float64, shape (at least n/size + 2, 5)
-        Output array for completed episodes, with the columns ``FIRST``, ``LAST``, ``CHANGED``, ``AXIS`` and ``PEAK``.
+        Output array for completed episodes, with the columns ``FIRST``, ``LAST``, ``KIND``, ``AXIS`` and ``PEAK``.
 
     Returns
     -------
@@ -216,11 +239,19 @@ def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floa
         _remember(now, number, s)
         s.place[HELD_MOVES] |= follows
     _learn(now, moves, number, size, s)
+    lasted = number - s.place[BEGAN]  # without the first block, which contains the onset
+    if s.place[BEGAN] >= 0 and MIN_NOISE_BLOCKS <= lasted <= MAX_NOISE_BLOCKS and _stationary(lasted, size, s):
+        _begin_anew(lasted, s)
+        s.place[TURNED] = NOISE
+        _end(s, episodes, filled)
     _emit(s, blocks, moving, filled)
     s.place[QUIET_RUN] = 0 if moves else min(s.place[QUIET_RUN] + 1, EPISODE_GAP_BLOCKS)
     s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= REMOVED_AFTER
     if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == EPISODE_GAP_BLOCKS:
-        _end(s, episodes, filled)
+        if s.place[TURNED] == MOTION and lasted <= MAX_NOISE_BLOCKS and _still_loud(size, s):
+            s.place[QUIET_RUN] -= 1
+        else:
+            _end(s, episodes, filled)
     for a in range(AXES):
         s.open[a, COUNT] = 0.0
 
@@ -424,6 +455,60 @@ def _steady(size: int, s: MotionState) -> bool:
 
 
 @compiled
+def _stationary(blocks: int, size: int, s: MotionState) -> bool:
+    """Return True if the most recent blocks have a constant variance and the mean of the reference on all axes."""
+    groups = blocks // GROUP_BLOCKS
+    means, variances = np.empty(groups), np.empty(groups)
+    for a in range(AXES):
+        if s.seen[a] < MIN_REFERENCE_BLOCKS:
+            return False
+        for g in range(groups):
+            n, total, squares, within = 0, 0.0, 0.0, 0.0
+            for back in range(g * GROUP_BLOCKS + 1, (g + 1) * GROUP_BLOCKS + 1):
+                k = (s.place[RECENT] - back) % REFERENCE_BLOCKS
+                mean = s.recent[MEAN, a, k] - s.ordered[MEAN, a, 0]
+                if mean == mean:
+                    n += 1
+                    total += mean
+                    squares += mean * mean
+                    within += exp(s.recent[LOG_VARIANCE, a, k])
+            if n < GROUP_BLOCKS - 1:
+                return False
+            means[g] = total / n
+            variances[g] = (within + max(squares - n * means[g] ** 2, 0.0)) / n
+        white = np.mean(variances) / (GROUP_BLOCKS * size)
+        n = min(s.seen[a], REFERENCE_BLOCKS)
+        usual = max(_scatter(s.ordered[MEAN, a], n), sqrt(white))
+        band = GROUP_SIGMA * usual + s.open[a, STEP]
+        rest = _quantile(s.ordered[MEAN, a], n, 0.5) - s.ordered[MEAN, a, 0]
+        scatter = max(GROUP_SIGMA * sqrt(2.0 / (GROUP_BLOCKS * size)), MIN_GROUP_SCATTER)
+        level = log(np.mean(variances))
+        rise = level - _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
+        if level > 2.0 * log(NEVER_AT_REST[a]) or (rise > LARGE_RISE and blocks < 2 * MIN_NOISE_BLOCKS):
+            return False
+        for g in range(groups):
+            if abs(means[g] - rest) > band or abs(log(variances[g]) - level) > scatter:
+                return False
+    return True
+
+
+@compiled
+def _still_loud(size: int, s: MotionState) -> bool:
+    """Return True if the variance of an axis is still higher than in the reference, but too low to count as motion."""
+    for a in range(AXES):
+        n = min(s.seen[a], REFERENCE_BLOCKS)
+        if n < MIN_REFERENCE_BLOCKS:
+            continue
+        level = 0.0
+        for back in range(1, GROUP_BLOCKS + 1):
+            level += s.recent[LOG_VARIANCE, a, (s.place[RECENT] - back) % REFERENCE_BLOCKS] / GROUP_BLOCKS
+        usual = max(0.5 * LOUDER, GROUP_SIGMA * sqrt(2.0 / (GROUP_BLOCKS * size)))
+        if level > _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5) + usual:
+            return True
+    return False
+
+
+@compiled
 def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
     """Write the recent values except NaN to ``ordered`` in ascending order, and return the number of values."""
     n = 0
@@ -503,6 +588,6 @@ def _end(s: MotionState, episodes: Floats, filled: Ints) -> None:
             axis = a
     episode = episodes[filled[1]]
     episode[FIRST], episode[LAST] = s.place[BEGAN], s.place[LATEST]
-    episode[CHANGED], episode[AXIS], episode[PEAK] = s.place[TURNED], axis, s.peaks[0, axis]
+    episode[KIND], episode[AXIS], episode[PEAK] = s.place[TURNED], axis, s.peaks[0, axis]
     filled[1] += 1
     s.place[BEGAN] = -1

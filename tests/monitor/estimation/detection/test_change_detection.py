@@ -150,8 +150,30 @@ def test_constant_axis_causes_no_alarm():
 
 def test_change_while_learning_becomes_part_of_the_reference():
     values = simulate_white_noise(60_000)
-    values[:2_000, GZ] *= 3.0
+    values[:500, GZ] *= 3.0
     assert find_changes(values) == []
+
+
+@pytest.mark.parametrize("factor", [2.0, 4.0, 10.0])
+@pytest.mark.parametrize("since", [1000, 3000, 6000])
+def test_noise_step_shortly_after_the_start_is_reported(since, factor):
+    values = simulate_white_noise(since + 4000)
+    values[since:, GZ] = 0.1 + factor * (values[since:, GZ] - 0.1)
+    change = find_single_change(values)
+    if since > 1000:
+        before, after = change.what["N"]
+        assert after / before == pytest.approx(factor, rel=0.2)
+    assert change.kind == "noise_changed"
+    assert change.since == pytest.approx(since, abs=150)
+    assert change.found < since + 1500
+
+
+def test_short_noise_step_is_reported_at_both_ends():
+    values = simulate_white_noise(15_000)
+    values[6_000:9_000, GZ] = 0.1 + 3.0 * (values[6_000:9_000, GZ] - 0.1)
+    rise, fall = find_changes(values)
+    assert rise.what["N"][1] / rise.what["N"][0] == pytest.approx(3.0, rel=0.2)
+    assert fall.what["N"][1] / fall.what["N"][0] == pytest.approx(1 / 3.0, rel=0.3)
 
 
 def test_constant_resonance_reduces_the_degrees_of_freedom():

@@ -175,15 +175,49 @@ def test_slight_motion_at_the_start_is_unlearned():
     ] == [60]
 
 
-def test_new_vibration_is_accepted_as_rest_after_a_minute():
+def test_vibration_that_varies_is_accepted_as_rest_after_a_minute():
     values = simulate_rest(240)
     rows = np.arange(len(values) - 10000)
-    values[10000:, 3:] += 0.2 * np.sin(2 * np.pi * 17.3 / RATE * rows)[:, None]
+    strength = 0.2 * (1.0 + 0.5 * np.sin(2 * np.pi * 0.3 / RATE * rows))
+    values[10000:, 3:] += (strength * np.sin(2 * np.pi * 17.3 / RATE * rows))[:, None]
     mask, (motion,) = detect_motion(values, RATE)
     assert motion.since / RATE == pytest.approx(100.0, abs=0.5)
     assert 60.0 <= motion.seconds <= 67.0
     assert not mask[motion.until :].any()
     assert REFERENCE_BLOCKS * BLOCK_S == 60.0
+
+
+@pytest.mark.parametrize("axes", [[2], [3], [0, 1, 2, 3, 4, 5]])
+@pytest.mark.parametrize("factor", [2.0, 4.0, 10.0])
+@pytest.mark.parametrize("since_s", [30, 100])
+def test_step_of_the_noise_level_is_not_motion(axes, factor, since_s):
+    values = simulate_rest(since_s + 60, seed=since_s)
+    rows = slice(100 * since_s, None)
+    values[rows, axes] = MEAN_AT_REST[axes] + factor * (values[rows, axes] - MEAN_AT_REST[axes])
+    mask, motions = detect_motion(values, RATE)
+    assert motions == []
+    assert not mask.any()
+
+
+@pytest.mark.parametrize("frequency_hz", [3.0, 23.4, 48.0])
+def test_constant_sinusoid_is_not_motion(frequency_hz):
+    values = simulate_rest(160)
+    values[10000:, 0] += 0.02 * np.sin(2 * np.pi * frequency_hz / RATE * np.arange(6000))
+    mask, motions = detect_motion(values, RATE)
+    assert motions == []
+    assert not mask.any()
+
+
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
+def test_short_vibration_is_motion(seconds):
+    rng = np.random.default_rng(7)
+    n = round(seconds * RATE)
+    for vibration in (rng.standard_normal((n, 3)), np.sin(2 * np.pi * 0.3 * np.arange(n))[:, None]):
+        values = simulate_rest(130)
+        values[10000 : 10000 + n, 3:] += 0.2 * vibration
+        mask, (motion,) = detect_motion(values, RATE)
+        assert motion.since / RATE == pytest.approx(100.0, abs=0.5)
+        assert mask[10000 : 10000 + n].all()
 
 
 def test_continuous_motion_is_never_accepted_as_rest():
