@@ -31,6 +31,7 @@ from monitor.estimation.allan.window_kernel import (
     LANES,
     LAST_MISSING,
     LINE,
+    MAX_PHASE_STEP,
     NEWEST,
     STAGE_SAMPLES,
     TOTAL,
@@ -161,6 +162,15 @@ class AllanWindow:
         """Number of samples since the window was emptied, including missing samples."""
         return int(self._state[TOTAL])
 
+    @property
+    def largest_value(self) -> Floats:
+        """Absolute values [6] in rad/s and m/s² from which samples count as missing, because the phase would overflow.
+
+        The limits are inversely proportional to the resolution of the phase, and are smallest for short windows: at
+        least 14 000 rad/s and 56 000 m/s², which no inertial sensor reaches.
+        """
+        return np.asarray(MAX_PHASE_STEP / self._scale[:AXES])
+
     def discard_samples(self) -> None:
         """Discard all samples in the window."""
         self.resets += 1
@@ -175,7 +185,7 @@ class AllanWindow:
         Parameters
         ----------
         values : ndarray of float, shape (n, 6)
-            Samples in rad/s and m/s². NaN and values of 1e7 or more count as missing samples.
+            Samples in rad/s and m/s². NaN and values from ``largest_value`` on count as missing samples.
 
         Raises
         ------

@@ -34,6 +34,8 @@ LEVEL: Final = 64
 """Number of newest samples whose mean is the reference level of an axis."""
 NEVER: Final = 1 << 62
 """Value that marks a missing reference level."""
+MAX_PHASE_STEP: Final = 4.0e18
+"""Largest change of the integer phase by one sample. The phase is a 64-bit integer, so larger values are ambiguous."""
 BEND_POINTS: Final = 64
 """Number of phase points that represent a block in a sum.
 
@@ -62,7 +64,7 @@ class WindowArrays(NamedTuple):
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
-    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
+    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples, modulo 2³²
 
 
 def window_memory_size(length: int, taus: int) -> int:
@@ -170,6 +172,15 @@ def _add_run(
             )  # fmt: skip
 
 
+@inlined
+def wrap_count(count: int) -> int:
+    """Return a count of missing samples, or a difference of two counts, modulo 2³² in the range of int32.
+
+    Differences of counts within a window are below 2³¹, so they are exact although the counts wrap around.
+    """
+    return ((count + (1 << 31)) & ((1 << 32) - 1)) - (1 << 31)
+
+
 @compiled
 def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
     before = LANES * state[NEWEST]
@@ -178,14 +189,14 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
     state[NEWEST] = now // LANES
     for lane in range(sample.size):
         y = sample[lane] * scaling[lane] + scaling[LANES + lane]
-        if abs(y) < 4.0e18:  # also false for NaN
+        if abs(y) < MAX_PHASE_STEP:  # also false for NaN
             step = np.rint(y)
             scaling[LANES + lane] = y - step
             phase[now + lane] = phase[before + lane] + np.int64(step)
-            count = missing[before + lane]
+            count = np.int64(missing[before + lane])
         else:
             phase[now + lane] = phase[before + lane]
-            count = missing[before + lane] + 1
+            count = wrap_count(np.int64(missing[before + lane]) + 1)
             state[LAST_MISSING] = state[TOTAL]
         if missing[now + lane] != count:  # Skipping writes of zeros saves memory.
             missing[now + lane] = count
@@ -330,7 +341,9 @@ def keep_newest(memory: Ints, taus: int, axis: int, n: int) -> None:
     # Give older phase points different counts of missing samples, so that older second differences count as incomplete.
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
-        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
+        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = wrap_count(
+            np.int64(missing[oldest]) - back
+        )
     state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         _recompute_sum(w, i, axis, n)
@@ -359,7 +372,7 @@ def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: in
     """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing."""
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
-    present = min(n, LEVEL) - (missing[last] - missing[first])
+    present = min(n, LEVEL) - wrap_count(np.int64(missing[last]) - missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
@@ -391,10 +404,11 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
         return np.nan
     at0, at1 = newest * LANES + axis, ring_row(newest - third, places) * LANES + axis
     at2, at3 = ring_row(newest - 2 * third, places) * LANES + axis, ring_row(newest - 3 * third, places) * LANES + axis
-    late, early = third - (missing[at0] - missing[at1]), third - (missing[at2] - missing[at3])
+    late = third - wrap_count(np.int64(missing[at0]) - missing[at1])
+    early = third - wrap_count(np.int64(missing[at2]) - missing[at3])
     if (
         min(late, early) < MIN_PRESENT_SHARE * third
-        or 3 * third - (missing[at0] - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
+        or 3 * third - wrap_count(np.int64(missing[at0]) - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
     ):
         return np.nan
     # Phase wraps modulo 2⁶⁴, so the small difference is computed before the conversion to floating point.
@@ -464,7 +478,7 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - n, places) * LANES + axis
     middle = _reference_level(phase, missing, newest, n, axis)
-    if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
+    if n < 2 * m or middle == NEVER or n - wrap_count(np.int64(missing[last]) - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride, has_gaps = max(1, m // BEND_POINTS), missing[last] != missing[first]
     total = 0.0
@@ -474,7 +488,7 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
         at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
         change = phase[at0] - phase[at1] - phase[at2] + phase[at3]
         if has_gaps:
-            change += middle * (missing[at0] - missing[at1] - missing[at2] + missing[at3])
+            change += middle * wrap_count(np.int64(missing[at0]) - missing[at1] - missing[at2] + missing[at3])
         total += float(change)
     points = (m + stride - 1) // stride
     # The number of second differences is n + 1 − 2m.

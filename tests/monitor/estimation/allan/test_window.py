@@ -609,3 +609,31 @@ def test_small_gap_hardly_changes_the_slope(gap):
     assert np.isnan(rate_slope_from_thirds(values)).all()
     assert np.isnan(window.drift_slopes_by_axis_and_tau()[1]).all()
     assert np.isnan(rate_slope_per_tau(values, factors)).all()
+
+
+@pytest.mark.parametrize("keep", [None, 600])
+def test_count_of_missing_samples_may_wrap_around_within_the_window(keep):
+    """A missing axis reaches 2³¹ missing samples within 25 days at 1 kHz."""
+    values = np.random.default_rng(5).standard_normal((1200, 6)) + 1e-3 * np.arange(1200)[:, None]
+    values[np.arange(7, 1200, 117)] = np.nan
+    results = []
+    for missing in (0, 2**31 - 4):
+        window = AllanWindow(1000, np.array([1, 10, 100]))
+        window._missing[:] = missing
+        window.append_samples(values)
+        if keep is not None:
+            window.keep_newest(0, keep)
+        results.append((window.avar(), *window.drift_slopes_by_axis_and_tau(), window.newest_samples(1, 1000)))
+    for expected, wrapped in zip(*results, strict=True):
+        assert np.isfinite(expected).any()
+        np.testing.assert_array_equal(wrapped, expected)
+
+
+@pytest.mark.parametrize("length", [100, 10_000, 1_000_000])
+def test_values_below_the_stated_limit_are_not_missing(length):
+    window = AllanWindow(length, np.array([1, length // 2]))
+    assert (window.largest_value >= [14_000.0] * 3 + [56_000.0] * 3).all()
+    for sign in (1.0, -1.0):
+        for factor, missing in ((0.999, False), (1.001, True)):
+            window.append_samples(sign * factor * window.largest_value[None, :])
+            assert np.isnan([window.newest_samples(axis, 1)[0] for axis in range(6)]).tolist() == [missing] * 6
