@@ -7,16 +7,18 @@ increasing length. A fault of one device does not affect other devices.
 """
 
 import json
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Final, Literal
 
 import numpy as np
 
-from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
+from drivers.data_types import AXES, NS_PER_S, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import DropCountingLink, Link
@@ -41,6 +43,8 @@ If ten sample periods are longer, they apply instead.
 """
 MAX_QUEUED_EVENTS: Final = 1000
 """Maximum number of events in the queue. If the queue is full, the oldest event is dropped."""
+MIN_STALL_S: Final = 0.5
+"""Minimum time in s by which a read lasts longer than READ_TIMEOUT_S if the process did not run meanwhile."""
 LOSS_REPORT_INTERVAL_S: Final = 1.0
 """Shortest time between two events about lost samples."""
 
@@ -140,6 +144,7 @@ class Driver:
         self._reported_drops = 0  # number of samples that the decoder dropped and that have been reported as missing
         self._last_data_s = 0.0
         self._last_sample_s = 0.0
+        self._last_read_s = inf  # end of the last read, on a clock that includes the time in which the host sleeps
         self._newest_t_ns = 0
         self._unreported_samples = self._unreported_gaps = 0  # missing samples and gaps since the last report
         self._reported_datagrams = 0  # number of dropped datagrams that have been reported
@@ -193,6 +198,7 @@ class Driver:
                 if not self.times_are_unix:
                     self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
+                self._last_read_s = _read_suspend_aware_clock_s()
                 while not self._stop.is_set():
                     self.read_and_push_once()
             except LinkEnded as error:
@@ -213,6 +219,10 @@ class Driver:
         self.iterations += 1
         asked_ns = time.monotonic_ns()
         chunks = self.link.wait_for_chunks_or_timeout(READ_TIMEOUT_S)
+        read_s = _read_suspend_aware_clock_s()
+        if read_s - self._last_read_s > READ_TIMEOUT_S + MIN_STALL_S:
+            self._handle_stall(chunks)
+        self._last_read_s = read_s
         self._report_lost()
         if chunks is None:
             if not self.times_are_unix:
@@ -281,6 +291,19 @@ class Driver:
         dropped, self._reported_datagrams = total - self._reported_datagrams, total
         return f"; {dropped} datagrams were dropped because the receive buffer was full" if dropped else ""
 
+    def _handle_stall(self, chunks: Sequence[Chunk] | None) -> None:
+        """Continue after a time in which the process was stopped, starved or asleep, so that received data have waited.
+
+        A read may time out without having looked at the data. The silence of the device is therefore measured again.
+        """
+        self._last_data_s = self._last_sample_s = time.monotonic()
+        if self.times_are_unix:
+            return
+        now_ns = time.monotonic_ns()
+        # The kernel stamps data that have waited with an earlier time, and the reader stamps them after the stall.
+        read_ns = [chunk.t_ns for chunk in (chunks or ())[:1] if now_ns - chunk.t_ns < MIN_STALL_S * NS_PER_S]
+        self.clock.note_stall(min(read_ns, default=now_ns))
+
     def _check_silence(self) -> None:
         silent_s = time.monotonic() - self._last_data_s
         if self._silence_s and silent_s > self._silence_s:
@@ -342,6 +365,11 @@ class Driver:
         # current time on the same clock as the sample times
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))
+
+
+def _read_suspend_aware_clock_s() -> float:
+    """Return a monotonic time in s that, on Linux, also advances while the host sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) if sys.platform == "linux" else time.monotonic()
 
 
 def parse_axis_map(table: dict[str, str]) -> AxisMap:

@@ -4,9 +4,9 @@ The hardware, the kernel or python-can passes on only frames with the identifier
 
 ``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a read is delayed, the queued frames arrived
 some time before the read. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on arrival with the system
-clock of the host. For these interfaces, the age of a frame is subtracted from the time of the read. An age outside the
-range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to the clock of the host. For
-other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the jitter by regression.
+clock of the host, which ``drivers.links.unix_to_monotonic_arrival`` converts. Other interfaces stamp frames with a
+clock that drifts relative to the clock of the host. For other interfaces, ``Chunk.t_ns`` is the time of the read, and
+the sample clock removes the jitter by regression.
 
 ``LinkLost`` is raised if the bus is off, the interface is down or the adapter is unplugged. Other error frames are
 counted and ignored. Remote frames are ignored. The link sends nothing except commands that configure an adapter.
@@ -180,9 +180,10 @@ class CanLink(PolledLink):
 
         bus = self._bus
         assert bus is not None
+        asked_ns = time.monotonic_ns()
         try:
             try:
-                return bus.recv(wait_s)
+                message = bus.recv(wait_s)
             except (can.CanOperationError, ValueError) as error:
                 if not isinstance(error, ValueError) and not isinstance(error.__cause__, ValueError):
                     raise
@@ -199,6 +200,9 @@ class CanLink(PolledLink):
             raise LinkLost(
                 f"{self.name}: the bus is gone (interface down or adapter unplugged): {describe_error(reason)}"
             ) from error
+        if message is None:
+            self._empty_ns = asked_ns
+        return message
 
     def _to_chunk(self, message: "can.Message") -> Chunk:
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
@@ -208,7 +212,7 @@ class CanLink(PolledLink):
         """Return the monotonic arrival time of a CAN frame, or the current time if the time stamp is unusable."""
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return time.monotonic_ns()
-        return monotonic_arrival_ns(round(message.timestamp * 1e9))
+        return monotonic_arrival_ns(round(message.timestamp * 1e9), self._empty_ns)
 
     def _count_error_frame(self, message: "can.Message") -> None:
         """Count an error frame. Raise LinkLost if the error frame reports bus-off."""

@@ -3,20 +3,28 @@
 import time
 from typing import Final
 
-MAX_AGE_S: Final = 1.0
-"""Largest age in s of received data. A time stamp with a larger or negative age is ignored."""
+TOLERANCE_NS: Final = 1_000_000_000
+"""Time in ns by which a time stamp may precede the time at which the link was empty."""
 CLOCK_PAIRS: Final = 3
 """Number of times that the Unix clock and the monotonic clock are read. The fastest reading is used."""
 
 
-def monotonic_arrival_ns(unix_ns: int) -> int:
+def monotonic_arrival_ns(unix_ns: int, empty_ns: int) -> int:
     """Return the monotonic arrival time of data with a Unix time stamp, or the current time if the stamp is unusable.
 
-    Both times are in ns. The stamp must come from the clock of this computer.
+    A stamp in the future, or from before the link was last empty, shows that the Unix clock was set. Such a stamp is
+    unusable.
+
+    Parameters
+    ----------
+    unix_ns
+        Unix time stamp in ns from the clock of this computer.
+    empty_ns
+        Monotonic time in ns at which the link last held no unread data.
     """
     now_ns = time.monotonic_ns()
-    age_ns = now_ns + _unix_minus_monotonic_ns() - unix_ns
-    return now_ns - age_ns if 0 <= age_ns <= MAX_AGE_S * 1e9 else now_ns
+    arrival_ns = unix_ns - _unix_minus_monotonic_ns()
+    return arrival_ns if empty_ns - TOLERANCE_NS <= arrival_ns <= now_ns else now_ns
 
 
 def _unix_minus_monotonic_ns() -> int:

@@ -2,8 +2,11 @@
 
 Sample times lie on a line fitted to arrival time against sample index, so that transport jitter has little effect.
 
-A short delay of the arrivals is attributed to the scheduler of the host. A delay that lasts for CATCH_UP_S means that
-samples are missing.
+The arrival time is an upper bound of the sample time, because samples may wait in a buffer. Only prompt arrivals change
+the line. A short delay of the arrivals is attributed to the scheduler of the host. A delay that lasts for CATCH_UP_S
+means that samples are missing. After the reader itself has stalled, the arrivals count as late until they come no
+faster than the device measures. If they are behind the line at that time, the buffer of the kernel has overflowed, and
+the samples in between are missing.
 """
 
 from collections.abc import Iterator
@@ -16,6 +19,7 @@ import numpy as np
 from drivers.data_types import NS_PER_S, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.newest_sample_time_lower_bound import NewestSampleTimeLowerBound
+from drivers.timing.rejected_frames import RejectedFrameTest
 
 CATCH_UP_S: Final = 3.0
 """Time in s after which a persistent delay of the arrivals means that samples are missing."""
@@ -23,6 +27,8 @@ MIN_GAP_PERIODS: Final = 3.0
 """Shortest pause between arrivals that can indicate missing samples, in sample periods."""
 MIN_GAP_S: Final = 0.05
 """Shortest pause between arrivals that can indicate missing samples, in seconds."""
+BURST_PERIODS: Final = 2.0
+"""Number of sample periods by which samples may arrive faster than the device measures without being a backlog."""
 JUMP_S: Final = 1.0
 """Maximum time in s by which a device clock may get ahead of the host clock. A larger step is a clock jump."""
 PERIOD_TOLERANCE: Final = 0.05
@@ -67,7 +73,9 @@ class ArrivalTimeline:
 
         Without an origin, Unix times in float64 would have a resolution of only 240 ns.
         """
+        self._rejected_frames = RejectedFrameTest()
         self._delay: _Delay | None = None
+        self._stall_end_ns: int | None = None  # end of a stall of the reader, until its backlog has been read
 
     def seconds_since_origin(self, t_ns: int) -> float:
         """Return the time since the first sample in seconds."""
@@ -102,7 +110,7 @@ class ArrivalTimeline:
         self.index = float(index[-1])
         self.arrived_ns = int(samples.t_ns[-1])
         arrived_s = self.seconds_since_origin(self.arrived_ns)
-        if self._delay is None:  # a delay that may be a gap must not affect the line
+        if self._arrivals_are_prompt:
             # The last sample of a chunk has the shortest delay.
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
@@ -120,6 +128,21 @@ class ArrivalTimeline:
         self.last_t_ns = int(t_ns[-1])
         return t_ns
 
+    def count_rejected_samples(self, arrived_ns: int, arrived: int, rejected: int) -> int:
+        """Return how many of the frames that were rejected before the newest samples were samples.
+
+        Parameters
+        ----------
+        arrived_ns : int
+            Arrival time of the newest sample in ns.
+        arrived : int
+            Number of samples that have arrived since the last call.
+        rejected : int
+            Number of frames that were rejected before these samples.
+        """
+        arrived_s = self.seconds_since_origin(arrived_ns)
+        return self._rejected_frames.count_missing(arrived_s, arrived, rejected, self.line.period_s())
+
     def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
         """Estimate the number of missing samples from the time since the previous arrival.
 
@@ -136,48 +159,79 @@ class ArrivalTimeline:
         elapsed_s = (arrived_ns - self.arrived_ns) / NS_PER_S
         return min(max(0, round(elapsed_s * min(rate_hz, MAX_RATE_HZ)) - arrived), MAX_GAP_SAMPLES)
 
+    @property
+    def _arrivals_are_prompt(self) -> bool:
+        """True unless the newest samples may have waited in a buffer, or samples before them may be missing."""
+        return self._delay is None and (self._stall_end_ns is None or self.arrived_ns < self._stall_end_ns)
+
+    def note_stall(self, stall_end_ns: int) -> None:
+        """Record that the reader has not run for some time before ``stall_end_ns``, so that unread data have waited."""
+        self._stall_end_ns = stall_end_ns
+
     def forget_delay(self) -> None:
         """Discard the current delay of the arrivals, because the link was closed."""
-        self._delay = None
+        self._delay = self._stall_end_ns = None
 
-    def estimate_missing_from_persistent_delay(
-        self, arrived_ns: int, counted: int, min_gap_samples: float = MIN_GAP_PERIODS
-    ) -> int:
-        """Estimate the number of missing samples from a sudden delay that has lasted for CATCH_UP_S.
+    def estimate_missing_from_delay(self, arrived_ns: int, arrived: int, counted: int, unit: float = 1.0) -> int:
+        """Estimate the number of missing samples from a sudden delay of the arrivals.
+
+        The delay has to last for CATCH_UP_S. After a stall of the reader, the delay is evaluated as soon as the backlog
+        has been read.
 
         Parameters
         ----------
         arrived_ns : int
             Arrival time of the newest sample in ns.
+        arrived : int
+            Number of samples that have arrived since the last call.
         counted : int
             Number of samples since the last call that have arrived or are known to be missing.
-        min_gap_samples : float
-            Minimum number of consecutive missing samples to detect.
+        unit : float
+            Number of samples of which the result is a multiple.
         """
         period_s = self.line.period_s()
-        if period_s is None or not self.line.has_enough_points_for_gaps:
+        if period_s is None:
             return 0
-        least_s = max(min_gap_samples * period_s, MIN_GAP_S)
+        least_s = max(MIN_GAP_PERIODS * period_s, MIN_GAP_S)
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
         behind_s = arrived_s - self.line.time_at_index_s(index)
+        elapsed_s = (arrived_ns - max(self.arrived_ns, self._stall_end_ns or 0)) / NS_PER_S
+        is_backlog = (arrived - BURST_PERIODS) * period_s > elapsed_s
+        if self._stall_end_ns is not None and arrived_ns >= self._stall_end_ns:
+            if is_backlog:
+                return 0
+            self._delay = self._stall_end_ns = None
+            gap = _count_samples(behind_s, period_s, unit) if behind_s > least_s else 0
+            if gap:
+                return gap
+        if not self.line.has_enough_points_for_gaps:
+            return 0
         if self._delay is None:
             pause_s = (arrived_ns - self.arrived_ns) / NS_PER_S - counted * period_s
             if pause_s > least_s and behind_s > least_s:
                 self._delay = _Delay(arrived_ns, behind_s, ArrivalRegression())
                 self._delay.line.add_point(index, arrived_s, self.nominal_hz)
             return 0
-        delay = self._delay
+        if not is_backlog:
+            self._delay.line.add_point(index, arrived_s, self.nominal_hz)
+        return self._update_delay(self._delay, arrived_ns, behind_s, unit)
+
+    def _update_delay(self, delay: "_Delay", arrived_ns: int, behind_s: float, unit: float) -> int:
+        """Return the number of missing samples once a delay has lasted for CATCH_UP_S, and 0 otherwise."""
+        period_s = self.line.period_s()
+        assert period_s is not None
+        least_s = max(MIN_GAP_PERIODS * period_s, MIN_GAP_S)
         delay.least_s = min(delay.least_s, behind_s)
-        delay.line.add_point(index, arrived_s, self.nominal_hz)
         if delay.least_s < least_s:  # the arrivals have caught up, so only the host was delayed
             self._delay = None
             return 0
         if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
             return 0
-        gap = min(round(delay.least_s / max(period_s, 1.0 / MAX_RATE_HZ)), MAX_GAP_SAMPLES)
+        gap = _count_samples(delay.least_s, period_s, unit)
         delay.line.shift_points(gap)
         rest_s = behind_s - gap * period_s
-        if delay.line.is_slower_than(period_s):  # the delay grows because the assumed period is wrong
+        # If the delay grows, the assumed period is wrong. Without missing samples, the arrivals have become later.
+        if not gap or delay.line.is_slower_than(period_s):
             self.line, self._delay = delay.line, None
         elif rest_s > least_s:  # another delay may have begun since
             delay.since_ns, delay.least_s = arrived_ns, rest_s
@@ -193,6 +247,12 @@ class _Delay:
     since_ns: int  # time of the first delayed arrival, or of the last reported gap
     least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line
     line: ArrivalRegression  # line fitted to the arrivals since the first delayed arrival
+
+
+def _count_samples(duration_s: float, period_s: float, unit: float) -> int:
+    """Return the number of samples in a duration as a multiple of ``unit``, limited to MAX_GAP_SAMPLES."""
+    units = round(duration_s / max(period_s, 1.0 / MAX_RATE_HZ) / unit)
+    return min(round(units * unit), MAX_GAP_SAMPLES) if units else 0
 
 
 def split_by_arrival_time(samples: SampleBlock, origin_ns: int) -> Iterator[SampleBlock]:

@@ -94,7 +94,7 @@ class CounterGaps:
         regular = near_typical and not first and self._counts_single_samples(ticks_per_sample)
         if not first and ticks_per_sample is not None:
             samples_by_ticks = len(samples) if regular else int(np.rint(steps / ticks_per_sample).sum())
-            wraps = self._hidden_wraps(samples_by_ticks, ticks_per_sample, arrived_ns, link_was_closed)
+            wraps = self._hidden_wraps(len(samples), samples_by_ticks, ticks_per_sample, arrived_ns, link_was_closed)
             steps[0] += counter.modulus * wraps
             regular = regular and not wraps
         self._tick = int(samples.ticks[-1])
@@ -109,11 +109,11 @@ class CounterGaps:
             self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and link_was_closed else 0
         )
         if not steps.any():  # a stuck counter says nothing about missing samples
-            missing[0] = max(samples.lost, unseen)
+            missing[0] = unseen
         elif self._has_jumped(missing, steps, arrived_ns):
             self._discard_jump(samples, missing, steps, first)
         if first:
-            missing[0] = max(samples.lost, unseen)
+            missing[0] = unseen
         return self._advance_device_clock(steps, missing)
 
     def _advance_device_clock(self, steps: Ints, missing: Ints) -> Ints:
@@ -158,10 +158,12 @@ class CounterGaps:
     def _sample_period_s(self) -> float | None:
         return self._timeline.earliest_time.period_s or self._timeline.undelayed_period_s()
 
-    def _hidden_wraps(self, counted: int, ticks_per_sample: float, arrived_ns: int, link_was_closed: bool) -> int:
+    def _hidden_wraps(
+        self, arrived: int, counted: int, ticks_per_sample: float, arrived_ns: int, link_was_closed: bool
+    ) -> int:
         """Estimate how many additional times the counter has wrapped during a pause of the data.
 
-        ``counted`` is the number of samples according to the counter steps.
+        ``arrived`` is the number of samples that have arrived, and ``counted`` is the number according to the counter.
         """
         counter, timeline = self._counter, self._timeline
         by_ticks_hz = 1.0 / (ticks_per_sample * counter.tick_s) if counter.tick_s else timeline.assumed_hz
@@ -174,7 +176,7 @@ class CounterGaps:
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
         else:
-            turns = round(timeline.estimate_missing_from_persistent_delay(arrived_ns, counted, turn / 2.0) / turn)
+            turns = round(timeline.estimate_missing_from_delay(arrived_ns, arrived, counted, turn) / turn)
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
     def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:

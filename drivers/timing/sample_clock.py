@@ -156,6 +156,18 @@ class SampleClock:
         """Record that the link was closed. The number of missing samples then follows from the next arrival time."""
         self._paused = True
 
+    def note_stall(self, stall_end_ns: int) -> None:
+        """Record that the reader has not run for some time, for example because the process was stopped.
+
+        Until the unread data of this time have been read, arrival times are only upper bounds of the sample times.
+
+        Parameters
+        ----------
+        stall_end_ns : int
+            End of the stall on the host clock in ns.
+        """
+        self._timeline.note_stall(stall_end_ns)
+
     def note_no_unread_data(self, host_t_ns: int) -> None:
         """Record a time on the host clock at which the link contained no unread data.
 
@@ -245,13 +257,13 @@ class SampleClock:
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
         """Estimate the number of missing samples before each sample [n] from arrival times."""
-        missing = np.zeros(len(samples), np.int64)
+        timeline, n = self._timeline, len(samples)
+        missing = np.zeros(n, np.int64)
         arrived_ns = int(samples.t_ns[-1])
+        rejected = timeline.count_rejected_samples(arrived_ns, n, samples.lost)
         if self._paused:
-            missing[0] = max(samples.lost, self._timeline.count_missing_since_arrival(arrived_ns, len(samples)))
-            self._timeline.forget_delay()
+            missing[0] = timeline.count_missing_since_arrival(arrived_ns, n)
+            timeline.forget_delay()
         else:
-            missing[0] = samples.lost + self._timeline.estimate_missing_from_persistent_delay(
-                arrived_ns, len(samples) + samples.lost
-            )
+            missing[0] = rejected + timeline.estimate_missing_from_delay(arrived_ns, n, n + rejected)
         return missing

@@ -55,6 +55,7 @@ class Ros2ImuDecoder(RejectingDecoder):
     def __init__(self) -> None:
         super().__init__()
         self.timing: Timing = SenderTimedFormat()
+        self._rejected = 0  # number of rejected messages
         self._lost_in_builder = 0  # number of lost messages that ``BlockBuilder`` has counted as bad
         self._lost = 0  # number of messages lost before the next message
         self._sequence: int | None = None
@@ -64,7 +65,7 @@ class Ros2ImuDecoder(RejectingDecoder):
     @property
     def bad(self) -> int:
         """Number of rejected messages and implausible samples."""
-        return self._builder.bad - self._lost_in_builder
+        return self._rejected + self._builder.bad - self._lost_in_builder
 
     def forget_stream_state(self) -> None:
         """Discard the last sequence number, so that no loss is reported for the next message."""
@@ -77,26 +78,23 @@ class Ros2ImuDecoder(RejectingDecoder):
         messages: list[_Message] = []
         ticks: list[int] = []
         missing: list[int] = []
-        rejected = 0
         for chunk in chunks:
-            sequence = self._read_sequence(chunk.attachment)
             try:
                 messages.append(_parse_message(chunk.data))
             except DecodeError as error:
                 self._rejection.note_rejection(str(error))
-                rejected += 1
+                self._rejected += 1
                 continue
             self._rejection.add_good_frames()
-            ticks.append(sequence)
-            missing.append(self._lost + rejected)
+            ticks.append(self._read_sequence(chunk.attachment))
+            missing.append(self._lost)
             self._lost_in_builder += self._lost
-            self._lost = rejected = 0
+            self._lost = 0
         return self._builder.build_plausible_blocks(
             np.array([m.t_ns for m in messages], np.int64),
             _read_values(messages),
             ticks=np.array(ticks, np.int64),
             bad_before=np.array(missing, np.int64),
-            bad_after=rejected,
         )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:

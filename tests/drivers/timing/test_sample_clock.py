@@ -691,7 +691,7 @@ def test_rate_check_is_pending_after_a_restart():
 @pytest.mark.parametrize("longest_stall_s", [0.3, 0.6, 1.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_period_after_rejected_lines_does_not_cause_endless_losses(seed, longest_stall_s):
-    """More rejected lines count as samples than the device can have sent. Then good samples arrive irregularly."""
+    """More lines are rejected than the device can have sent samples. Then good samples arrive irregularly."""
     rng = np.random.default_rng(seed)
     clock = SampleClock(ArrivalTimedFormat(), 100.0)
     total_lost = 0
@@ -712,7 +712,7 @@ def test_wrong_period_after_rejected_lines_does_not_cause_endless_losses(seed, l
     total_lost += feed_at(0.0, 50)
     total_lost += stream(0.3, 2.8)
     total_lost += feed_at(3.8, 50, rejected=446)
-    assert total_lost == 446
+    assert total_lost == 0
     settling = stream(3.8, 20.0)
     assert settling < 1.5 * 100.0 * longest_stall_s  # caused by the delays of the first seconds
     assert stream(20.0, 120.0) < 3 * 100.0 * longest_stall_s

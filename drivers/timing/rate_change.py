@@ -1,0 +1,82 @@
+"""Detect a change of the sample rate from two consecutive windows of sample times.
+
+The rates of both windows have to differ from the rate before the windows, and to agree with each other. A window lasts
+until its rate can be measured, which takes at least 2 s and 20 samples. Samples that are lost without being counted
+change the rate of a window at random. The limit of such formats therefore depends on the number of samples: for losses
+of 5 % with a mean burst length of 3 samples, it is four standard deviations.
+"""
+
+from math import log, sqrt
+from typing import Final
+
+from drivers.timing.arrival_regression import ArrivalRegression
+
+MIN_CHANGE: Final = 0.05
+"""Minimum relative change of the rate. Slowly varying delays of the arrivals cause smaller changes."""
+UNCOUNTED_LOSS_FACTOR: Final = 1.5
+"""Limit of the relative change times the square root of the number of samples, if lost samples are not counted."""
+
+
+class RateChangeDetector:
+    """Detector of a change of the sample rate.
+
+    Parameters
+    ----------
+    losses_are_counted : bool
+        True if lost samples are included in the sample index.
+
+    Examples
+    --------
+    >>> detector = RateChangeDetector(losses_are_counted=True)
+    >>> times_s = [min(i, 1000) * 0.01 + max(i - 1000, 0) * 0.02 for i in range(1500)]
+    >>> found = [detector.add_point(i, t, (100.0, 0.001)) for i, t in enumerate(times_s)]
+    >>> [round(line.measure_rate()[0], 3) for line in found if line is not None][0]
+    50.0
+    """
+
+    def __init__(self, losses_are_counted: bool) -> None:
+        self.losses_are_counted = losses_are_counted
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard both windows."""
+        self._line: ArrivalRegression | None = None  # regression of the newest window
+        self._first_index = 0.0
+        self._before: tuple[float, float] | None = None  # rate in Hz before the windows, and its uncertainty
+        self._candidate: tuple[float, float] | None = None  # rate of the last window, if the rate differs from _before
+
+    def add_point(self, index: float, t_s: float, rate: tuple[float, float] | None) -> ArrivalRegression | None:
+        """Add a point, and return the regression line of the newest window if the sample rate has changed.
+
+        Parameters
+        ----------
+        index : float
+            Sample index.
+        t_s : float
+            Time of the sample in s.
+        rate : tuple of float, or None
+            Present sample rate in Hz and its relative uncertainty; None if unknown.
+        """
+        if self._line is None:
+            self._line, self._first_index = ArrivalRegression(), index
+            if self._candidate is None:
+                self._before = rate
+        line = self._line
+        line.add_point(index, t_s)
+        found = line.measure_rate()
+        if found is None:
+            return None
+        self._line = None
+        if self._before is None or not self._differ(found, self._before, index):
+            self._candidate = None
+        elif self._candidate is not None and not self._differ(found, self._candidate, index):
+            return line
+        else:
+            self._candidate = found
+        return None
+
+    def _differ(self, a: tuple[float, float], b: tuple[float, float], index: float) -> bool:
+        limit = max(MIN_CHANGE, a[1] + b[1])
+        if not self.losses_are_counted:
+            limit = max(limit, UNCOUNTED_LOSS_FACTOR / sqrt(index - self._first_index))
+        return abs(log(a[0] / b[0])) > limit

@@ -1,0 +1,102 @@
+"""Tests of sample times after a stall of the reader, with simulated buffers that keep the oldest data and overflow."""
+
+import numpy as np
+import pytest
+
+from drivers.data_types import NS_PER_S, ArrivalTimedFormat, Chunk, CounterTimedFormat, Timing, make_block
+from drivers.decoders.text_lines import text
+from drivers.driver import Driver
+from drivers.links import unix_to_monotonic_arrival
+from drivers.timing.sample_clock import SampleClock
+from tests.support.loopback_link import LoopbackLink
+from tests.support.settings import read_settings
+
+RATE_HZ = 100.0
+START_S = 1e5
+STALL_AT_S = 40.0
+SENSORS = {
+    "no counter": ArrivalTimedFormat(),
+    "device clock": CounterTimedFormat(1 << 62, 1e-9),
+    "16-bit counter": CounterTimedFormat(1 << 16),
+    "8-bit counter": CounterTimedFormat(1 << 8),
+}
+
+
+def read_through_buffer(taken_s: np.ndarray, stall_s: float, capacity: int, most: int, stamped: bool) -> list:
+    """Return the reads: time of the read, sample numbers, and arrival times that the link states."""
+    reads, waiting, sent, t_s, stalled = [], [], 0, taken_s[0], False
+    while sent < taken_s.size or waiting:
+        t_s += 0.01
+        if not stalled and t_s > START_S + STALL_AT_S:
+            t_s, stalled = t_s + stall_s, True
+        while sent < taken_s.size and taken_s[sent] <= t_s:
+            waiting += [sent] if len(waiting) < capacity else []
+            sent += 1
+        now, waiting = np.array(waiting[:most], int), waiting[most:]
+        if now.size:
+            reads.append((t_s, now, taken_s[now] if stamped else np.full(now.size, t_s)))
+    return reads
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+@pytest.mark.parametrize(("stall_s", "capacity"), [(2.0, 277), (20.0, 277), (20.0, 10_000)])
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize("timing", SENSORS.values(), ids=SENSORS)
+def test_stall_neither_bends_times_nor_miscounts(
+    timing: Timing, configured: bool, stall_s: float, capacity: int, stamped: bool
+) -> None:
+    taken_s = START_S + np.arange(8_000) / RATE_HZ
+    clock = SampleClock(timing, RATE_HZ if configured else None)
+    blocks, before_s = [], START_S
+    for read_s, index, arrived_s in read_through_buffer(taken_s, stall_s, capacity, 256, stamped):
+        if read_s - before_s > 0.7:
+            clock.note_stall(round((read_s if not stamped else read_s - 0.005) * NS_PER_S))
+        before_s = read_s
+        ticks = None
+        if isinstance(timing, CounterTimedFormat):
+            ticks = np.rint(index / RATE_HZ / (timing.tick_s or 1.0 / RATE_HZ)).astype(np.int64) % timing.modulus
+        values = np.repeat(index[:, None].astype(np.float64), 6, axis=1)
+        blocks += clock.assign_times(make_block(np.rint(arrived_s * NS_PER_S).astype(np.int64), values, None, ticks))
+    t_ns = np.concatenate([block.t_ns for block in blocks])
+    index = np.concatenate([block.values[:, 0] for block in blocks]).astype(int)
+    error_s = (t_ns / NS_PER_S - taken_s[index])[index > 300]
+    assert (np.diff(t_ns) > 0).all()
+    assert sum(block.lost for block in blocks) == pytest.approx(8_000 - len(t_ns), abs=2)
+    # The last read of the backlog also contains samples that were sent after the overflow.
+    assert np.count_nonzero(np.abs(error_s - np.median(error_s)) > 0.02) <= 2
+    assert clock.measured_hz == pytest.approx(RATE_HZ, rel=1e-4)
+    assert clock.take_events() == []
+
+
+def test_stopped_driver_reports_no_lost_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A read may time out after the process was stopped, although data are waiting."""
+    decoder = text.build(read_settings(text.Settings, {"columns": ["gx"], "first_line": "keep"}))
+    link, rows, now_s = LoopbackLink(), [], [START_S]
+    for name in ("monotonic", "_read_suspend_aware_clock_s"):
+        target = "drivers.driver.time.monotonic" if name == "monotonic" else f"drivers.driver.{name}"
+        monkeypatch.setattr(target, lambda: now_s[0])
+    driver = Driver("a", link, decoder, SampleClock(decoder.timing, RATE_HZ), rows.append, silence_s=3.0)
+    link.open()
+
+    def read(chunks: list[Chunk]) -> None:
+        monkeypatch.setattr(link, "wait_for_chunks_or_timeout", lambda timeout_s: chunks or None)
+        driver.read_and_push_once()
+
+    for i in range(5):
+        now_s[0] = START_S + 0.01 * i
+        read([Chunk(b"0.1\n", round(now_s[0] * NS_PER_S))])
+    now_s[0] += 20.0
+    read([])
+    read([Chunk(b"0.1\n" * 100, round(now_s[0] * NS_PER_S))])
+    assert driver.counts.received == 105
+    assert driver.take_events() == []
+
+
+@pytest.mark.parametrize("age_s", [0.1, 15.0])
+def test_kernel_stamp_of_data_that_waited_is_kept(age_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unix_to_monotonic_arrival.time, "monotonic_ns", lambda: 10**14)
+    monkeypatch.setattr(unix_to_monotonic_arrival.time, "time_ns", lambda: 17 * 10**17)
+    stamp_ns = 17 * 10**17 - round(age_s * NS_PER_S)
+    convert = unix_to_monotonic_arrival.monotonic_arrival_ns
+    assert convert(stamp_ns, 10**14 - 20 * 10**9) == 10**14 - round(age_s * NS_PER_S)
+    assert convert(stamp_ns - 30 * 10**9, 10**14 - 20 * 10**9) == 10**14  # the clock of the host was set
