@@ -3,10 +3,12 @@
 Each reader checks the number of samples before allocating memory. Checking the file size is not sufficient, because a
 compressed file of a few megabytes can unpack to gigabytes.
 
-Four limits apply (docs/reference/limits.md):
+These limits apply (docs/reference/limits.md):
 
 - The samples and the copies made during an analysis must fit into the available memory.
-- A file contains at most ``MIN_ROW_LIMIT`` rows or ``MAX_ROWS_PER_BYTE`` rows per byte on disk, whichever is more.
+- Reading a file takes at most 500 MB, or 32 bytes per byte on disk if this is more. The file therefore contains at most
+  ``MIN_ROW_LIMIT`` rows, or one row for each ``MIN_BYTES_PER_ROW`` bytes on disk. Content that is held as a whole while
+  it is read has at most ``MIN_HELD_LIMIT_BYTES``, or ``MAX_HELD_RATIO`` times the size on disk.
 - The unpacked size is at most ``MIN_UNPACKED_LIMIT_BYTES`` or ``MAX_UNPACKING_RATIO`` times the size on disk, whichever
   is more.
 - A file contains at most ``MAX_COLUMNS`` columns.
@@ -30,9 +32,12 @@ COPIES: Final = 3.0
 """Minimum number of copies of the samples that an analysis keeps in memory."""
 ROW_BYTES: Final = 64
 """Size in bytes of one sample in memory. A sample consists of the time, six axes and the temperature as float64."""
-MIN_ROW_LIMIT: Final = 20_000_000
-MAX_ROWS_PER_BYTE: Final = 8
-"""Maximum number of rows per byte on disk. In every format, a row of measured values needs more than one bit."""
+MIN_ROW_LIMIT: Final = 2_800_000
+MIN_BYTES_PER_ROW: Final = 4
+"""Minimum size of a row on disk, in a file with more than MIN_ROW_LIMIT rows. Quantized noise of seven columns, whose
+standard deviation is one quantization step, needs 6.2 bytes in a compressed .npz file."""
+MIN_HELD_LIMIT_BYTES: Final = 250_000_000
+MAX_HELD_RATIO: Final = 16
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
@@ -56,10 +61,11 @@ class RecordingSizeLimits:
         ConfigError
             If the samples do not fit into the available memory.
         """
-        if rows > max(MIN_ROW_LIMIT, MAX_ROWS_PER_BYTE * self.size_bytes):
+        if rows > max(MIN_ROW_LIMIT, self.size_bytes // MIN_BYTES_PER_ROW):
             raise RecordingError(
                 f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are not measured samples; "
-                f"the limit is {MIN_ROW_LIMIT} rows, or {MAX_ROWS_PER_BYTE} rows per byte in a larger file"
+                f"the limit is {MIN_ROW_LIMIT} rows, or one row per {MIN_BYTES_PER_ROW} bytes in a larger file; "
+                "if they are measured, split the file or store it without compression"
             )
         self.check_needed_memory(COPIES * rows * ROW_BYTES)
 
@@ -70,6 +76,16 @@ class RecordingSizeLimits:
                 f"{self.path}: more than {needed_bytes / 1e9:.1f} GB of memory would be needed, "
                 f"{self.free / 1e9:.1f} GB are free; read the end of a folder with --last 1d, or split the file"
             )
+
+    def check_held_size(self, held_bytes: int) -> None:
+        """Raise RecordingError if the unpacked content that is held in memory is too large for the file."""
+        if held_bytes > max(MIN_HELD_LIMIT_BYTES, MAX_HELD_RATIO * self.size_bytes):
+            raise RecordingError(
+                f"{self.path}: unpacks to more than {held_bytes / 1e6:.0f} MB from {self.size_bytes / 1e6:.1f} MB; "
+                f"the limit is {MIN_HELD_LIMIT_BYTES / 1e6:g} MB, or {MAX_HELD_RATIO} times the size of the file; "
+                "split the file or store it without compression"
+            )
+        self.check_needed_memory(COPIES * held_bytes)
 
     def check_unpacked_size(self, unpacked_bytes: int) -> None:
         """Raise RecordingError if the unpacked data exceed the size limit."""

@@ -90,9 +90,9 @@ def test_mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.write_bytes(whole[:200])
     assert "contains no vector and no matrix of numbers (The file is cut off" in refusal(path)
     path.write_bytes(whole)
-    monkeypatch.setattr(memory_check, "MIN_UNPACKED_LIMIT_BYTES", 10_000)
-    monkeypatch.setattr(memory_check, "MAX_UNPACKING_RATIO", 1)
-    assert "unpacks to more than" in refusal(path)
+    monkeypatch.setattr(memory_check, "MIN_HELD_LIMIT_BYTES", 10_000)
+    monkeypatch.setattr(memory_check, "MAX_HELD_RATIO", 1)
+    assert refusal(path).startswith(f"{path}: unpacks to more than")
 
 
 def test_flipped_bytes_never_end_in_a_traceback(tmp_path: Path) -> None:

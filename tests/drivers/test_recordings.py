@@ -7,6 +7,7 @@ import os
 import pickle
 import re
 import resource
+import subprocess
 import sys
 import tracemalloc
 import zipfile
@@ -861,6 +862,40 @@ class TestRoom:
         with pytest.raises(RecordingError, match=r"rows in a file of \d+ bytes are not measured samples"):
             load_samples(path, 100.0)
 
+    @pytest.mark.parametrize("suffix", [".npz", ".csv.gz", ".parquet", ".arrow", ".mat"])
+    def test_a_small_file_that_would_need_more_than_500_mb_is_refused_within_500_mb(self, tmp_path, suffix):
+        path = tmp_path / f"x{suffix}"
+        n = 12_000_000
+        if suffix == ".npz":
+            np.savez_compressed(path, gx=np.zeros(n), fs=np.array(100.0))
+        elif suffix == ".csv.gz":
+            written(path, "gx\n" + "0\n" * n)
+        elif suffix == ".mat":
+            savemat = pytest.importorskip("scipy.io").savemat
+            savemat(path, {"gx": np.zeros((n, 1)), "gy": np.zeros((n, 1)), "gz": np.zeros((n, 1))}, do_compression=True)
+        else:
+            pa = pytest.importorskip("pyarrow")
+            columns = pa.table({"gx": np.zeros(n)})
+            if suffix == ".parquet":
+                pytest.importorskip("pyarrow.parquet").write_table(columns, path)
+            else:
+                options = pa.ipc.IpcWriteOptions(compression="zstd")
+                with pa.ipc.new_file(str(path), columns.schema, options=options) as writer:
+                    writer.write_table(columns)
+        assert path.stat().st_size < 5_000_000
+        code = (
+            "import re, sys; from pathlib import Path; from drivers.recordings import load_samples\n"
+            "try: load_samples(Path(sys.argv[1]), 100.0)\n"
+            "except ValueError as error: print(error)\n"
+            "print(1024 * int(re.search('VmHWM:[^0-9]*([0-9]+)', Path('/proc/self/status').read_text())[1]))\n"
+        )
+        output = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True).stdout
+        *message, peak_bytes = output.splitlines()
+        assert int(peak_bytes) < 500e6
+        assert len(message) == 1
+        assert message[0].startswith(f"{path}: ")
+        assert "store it without compression" in message[0]
+
     def test_a_file_that_unpacks_to_more_than_the_limit(self, tmp_path, monkeypatch):
         text = written(tmp_path / "x.csv.gz", "t,gx\n" + ("0,1" + " " * 5000 + "\n") * 2000)
         np.savez_compressed(tmp_path / "x.npz", gx=np.zeros(10**6))
@@ -896,7 +931,7 @@ class TestLimits:
         assert len(recording) == 3
 
     def test_mostly_bad_lines_are_not_all_looked_at(self, tmp_path, monkeypatch):
-        path = written(tmp_path / "x.csv", "t,gx\n" + "x\n" * 3 * READ_BYTES)
+        path = written(tmp_path / "x.csv", "t,gx\n" + "x\n" * 2 * READ_BYTES)
         with pytest.raises(RecordingError, match=r"\d{6} of \d{6} lines are not samples \(line 2"):
             load_samples(path)
 

@@ -19,7 +19,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from drivers.errors import RecordingError
+from drivers.errors import ImuError, RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_options import ReadingOptions
@@ -78,6 +78,8 @@ def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], floa
                     columns |= _name_columns(name, array)
                     limit.check_row_count(max(array.shape))
                 table.check_column_count(path, len(columns))
+        except ImuError:
+            raise
         except EOFError:
             notes.append("The file is cut off; the variables after the cut are missing.")
         except (ValueError, OverflowError, struct.error, zlib.error) as error:
@@ -114,8 +116,7 @@ def _iter_variables(file: IO[bytes], order: str, limit: memory_check.RecordingSi
             pieces = []
             for piece in _iter_unpacked(file, size):
                 unpacked += len(piece)
-                limit.check_unpacked_size(unpacked)
-                limit.check_needed_memory(memory_check.COPIES * unpacked)
+                limit.check_held_size(unpacked)
                 pieces.append(piece)
             content = _Content(memoryview(b"".join(pieces)), order)
             kind, data = content.read_element()
