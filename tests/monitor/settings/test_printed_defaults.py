@@ -10,6 +10,7 @@ import drivers.decoders
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
+from drivers.units import ACCELERATION, RATE, TEMPERATURE
 from drivers.validation import module_lookup
 from drivers.validation.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.commands.check_configuration import check_configuration
@@ -170,3 +171,13 @@ def test_unknown_name_is_refused_with_a_suggestion() -> None:
         printed_defaults.format_link_defaults("seral")
     with pytest.raises(ConfigError, match='"tekst"; possible are text, '):
         printed_defaults.format_decoder_defaults("tekst")
+
+
+@pytest.mark.parametrize(
+    ("key", "table"), [("gyro_unit", RATE), ("accel_unit", ACCELERATION), ("temperature_unit", TEMPERATURE)]
+)
+def test_every_unit_is_listed(key, table):
+    [line] = [
+        line for line in printed_defaults.format_decoder_defaults("text").splitlines() if line.startswith(f"{key} = ")
+    ]
+    assert line.rpartition(": ")[2].split(", ") == list(table)

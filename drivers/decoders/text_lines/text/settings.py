@@ -102,13 +102,13 @@ class Settings(SettingsModel):
         description='text between two fields, " " = any number of blanks; auto: comma, semicolon, tab or blanks',
     )
     gyro_unit: Annotated[str, _unit(units.angular_rate_factor, "gx")] = Field(
-        "rad/s", description="unit of gx gy gz: rad/s, mrad/s, deg/s, dps, deg/h, ..."
+        "rad/s", description=f"unit of gx gy gz: {', '.join(units.RATE)}"
     )
     accel_unit: Annotated[str, _unit(units.acceleration_factor, "ax")] = Field(
-        "m/s²", description="unit of ax ay az: m/s², g, mg, ..."
+        "m/s²", description=f"unit of ax ay az: {', '.join(units.ACCELERATION)}"
     )
     temperature_unit: Annotated[str, _unit(units.temperature_factor_and_offset, "temperature")] = Field(
-        "°C", description="unit of the temperature: °C, K, °F"
+        "°C", description=f"unit of the temperature: {', '.join(units.TEMPERATURE)}"
     )
     scale: dict[Annotated[str, one_of(COLUMNS)], Annotated[float, SCALE]] = Field(
         {},
