@@ -183,7 +183,8 @@ class TextDecoder(base.RejectingDecoder):
         if fields is None:
             return None, f"a line does not match the pattern: {body[:60]!r}"
         if len(fields) != self._width:
-            return None, f"a line has {len(fields)} columns, expected {self._width}: {body[:60]!r}"
+            todo = "correct `columns`, or describe the line with `pattern`"
+            return None, f"a line has {len(fields)} columns, expected {self._width}: {body[:60]!r}; {todo}"
         try:
             return [self._parse_field(f, at) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
         except ValueError:

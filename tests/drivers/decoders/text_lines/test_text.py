@@ -99,6 +99,7 @@ def test_recent_problem_describes_the_error_until_lines_are_good() -> None:
     decoder = build(Settings(columns=AXES))
     decoder.feed([Chunk(b"\n1,2,3\n", 0)])
     assert "3 columns, expected 6" in decoder.recent_problem
+    assert decoder.recent_problem.endswith("; correct `columns`, or describe the line with `pattern`")
     decoder.feed([Chunk(b"1,2,3,4,5,gyro\n", 0)])
     assert "not a number" in decoder.recent_problem
     decoder.feed([Chunk(LINE * 1000, 0)])
