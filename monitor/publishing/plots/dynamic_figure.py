@@ -29,7 +29,7 @@ COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
 MIN_ESTIMATED_SHARE: Final = 0.05  # a coefficient that is estimated in a smaller share of the time steps has no panel
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels of changes, as a share of the width
-COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
+COLOUR_SCALE_RATIOS: Final = (2.0, 3.0, 5.0, 10.0)  # possible upper ends; a smaller end would emphasize chance
 MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the changed cells inside the colour scale
 BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of confidence bands that lie inside a panel
 
