@@ -147,6 +147,7 @@ EVENT_KINDS: Final = (
     "samples_lost",
     "samples_repeated",
     "clock_jumped",
+    "rate_changed",
     "moved",
     "noise_changed",
     "bias_stepped",

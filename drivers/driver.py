@@ -247,6 +247,9 @@ class Driver:
                 self._push(self._axes.map_axes(stamped))
                 dropped = 0  # the dropped samples are missing only before the first block
         self._count_decoder_drops()
+        if false_losses := self.clock.take_false_losses():
+            self.counts.lost = max(self.counts.lost - false_losses, 0)
+            self._unreported_samples = self._unreported_gaps = 0
         self._report_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":

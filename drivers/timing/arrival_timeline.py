@@ -19,6 +19,7 @@ import numpy as np
 from drivers.data_types import NS_PER_S, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.newest_sample_time_lower_bound import NewestSampleTimeLowerBound
+from drivers.timing.rate_change import MIN_CHANGE, RateChangeDetector
 from drivers.timing.rejected_frames import RejectedFrameTest
 
 CATCH_UP_S: Final = 3.0
@@ -53,10 +54,12 @@ class ArrivalTimeline:
     Parameters
     ----------
     nominal_hz : float or None
-        Configured sample rate in Hz.
+        Configured sample rate in Hz, until the rate has changed.
+    losses_are_counted : bool
+        True if a counter shows how many samples are missing.
     """
 
-    def __init__(self, nominal_hz: float | None) -> None:
+    def __init__(self, nominal_hz: float | None, losses_are_counted: bool) -> None:
         self.nominal_hz = nominal_hz
         self.assumed_hz = nominal_hz
         """Sample rate in Hz before a rate has been measured: the configured rate, or the rate before a restart."""
@@ -73,6 +76,11 @@ class ArrivalTimeline:
 
         Without an origin, Unix times in float64 would have a resolution of only 240 ns.
         """
+        self.false_losses = 0
+        """Number of samples that were counted as missing before a change of the sample rate was detected."""
+        self.rate_change: tuple[float | None, float] | None = None
+        """Old and new sample rate in Hz after a change of the rate, until ``SampleClock`` has reported the change."""
+        self.rate_changes = RateChangeDetector(losses_are_counted)
         self._rejected_frames = RejectedFrameTest()
         self._delay: _Delay | None = None
         self._stall_end_ns: int | None = None  # end of a stall of the reader, until its backlog has been read
@@ -84,6 +92,31 @@ class ArrivalTimeline:
     def restart_line(self) -> None:
         """Discard the regression line after a clock jump or an unknown number of missing samples."""
         self.line = ArrivalRegression()
+        self.rate_changes.restart()
+
+    def change_rate(self, rate_hz: float, line: ArrivalRegression | None = None) -> None:
+        """Continue with another sample rate.
+
+        Parameters
+        ----------
+        rate_hz : float
+            New sample rate in Hz.
+        line : ArrivalRegression, optional
+            Regression line of the samples since the change. Without a line, the regression starts again.
+        """
+        old_hz = self.rate_changes.steady_rate_hz or self.line.rate_hz() or self.assumed_hz
+        self.rate_change = (old_hz, rate_hz)
+        self.restart_line()
+        self.line = line or self.line
+        self.nominal_hz = self.assumed_hz = rate_hz
+        self._delay = None
+
+    def find_rate_change(self, index: float, t_s: float) -> None:
+        """Add a prompt sample to the detector of rate changes, and adopt a new sample rate."""
+        changed = self.rate_changes.add_point(index, t_s, self.line.measure_rate())
+        found = changed.measure_rate() if changed is not None else None
+        if found is not None:
+            self.change_rate(found[0], changed)
 
     def undelayed_period_s(self) -> float | None:
         """Return the sample period in s, estimated without delayed arrivals.
@@ -113,6 +146,7 @@ class ArrivalTimeline:
         if self._arrivals_are_prompt:
             # The last sample of a chunk has the shortest delay.
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
+            self.find_rate_change(self.index, arrived_s)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
         period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a rate, only the order is known
         # A sample cannot have been taken after it arrived. JUMP_S allows for the jitter of the arrival times.
@@ -226,6 +260,10 @@ class ArrivalTimeline:
             self._delay = None
             return 0
         if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
+            return 0
+        found = delay.line.measure_rate()
+        if found is not None and found[0] * period_s < 1.0 - MIN_CHANGE - found[1]:
+            self.change_rate(found[0], delay.line)
             return 0
         gap = _count_samples(delay.least_s, period_s, unit)
         delay.line.shift_points(gap)

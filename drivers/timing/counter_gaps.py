@@ -17,13 +17,19 @@ from drivers.data_types import NS_PER_S, CounterTimedFormat, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, MAX_RATE_HZ, PERIOD_TOLERANCE, ArrivalTimeline
 from drivers.timing.event_rate_limiter import EventRateLimiter
+from drivers.timing.rate_change import RateChangeDetector, count_false_losses
 
 MAX_STEP_TICKS: Final = 1 << 62
 """Largest possible step of a device counter."""
 MIN_STUCK_SAMPLES: Final = 10
 """Number of consecutive samples with the same counter value after which a stuck counter is reported."""
-STEP_HISTORY: Final = 255
+STEP_HISTORY: Final = 16
 """Number of recent counter steps from which the typical step is determined."""
+MIN_NEW_STEPS: Final = 12
+"""Number of recent counter steps that differ from the typical step after a change of the sample rate.
+
+If 5 % of the samples are lost independently, the probability of 12 such steps of 16 is 4e-13.
+"""
 STEP_TOLERANCE: Final = 0.25
 """Maximum relative difference between a counter step and the typical step."""
 RATE_TOLERANCE: Final = 0.1
@@ -52,6 +58,7 @@ class CounterGaps:
         self._timeline = timeline
         self._events = events
         self._tick: int | None = None  # last counter value
+        self._rate_changes = RateChangeDetector(losses_are_counted=True)  # on the clock of the device
         self._clock_s = self._clock_index = 0.0
         self._stuck = 0  # number of samples since the counter last advanced
 
@@ -67,6 +74,11 @@ class CounterGaps:
         """
         self._tick = tick
         self.typical_step.add_steps(np.array([round(ticks_per_sample)]))
+
+    def restart_device_clock(self) -> None:
+        """Discard the regression of device time after a change of the sample rate."""
+        self.clock_line = ArrivalRegression()
+        self._rate_changes.restart()
 
     def forget_last_tick(self) -> None:
         """Discard the last counter value after samples without a counter value."""
@@ -89,7 +101,10 @@ class CounterGaps:
         steps[0] = samples.ticks[0] - previous % counter.modulus
         np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
         steps %= counter.modulus
+        before = self.typical_step.mean_ticks_per_sample
         near_typical = self.typical_step.add_steps(steps)
+        if before is not None and self.typical_step.changed:
+            self._adopt_new_step(before, len(steps))
         ticks_per_sample = self._ticks_per_sample()
         regular = near_typical and not first and self._counts_single_samples(ticks_per_sample)
         if not first and ticks_per_sample is not None:
@@ -122,7 +137,24 @@ class CounterGaps:
             self._clock_s += float(steps.sum()) * self._counter.tick_s
             self._clock_index += len(steps) + int(missing.sum())
             self.clock_line.add_point(self._clock_index, self._clock_s)
+            changed = self._rate_changes.add_point(self._clock_index, self._clock_s, self.clock_line.measure_rate())
+            found = changed.measure_rate() if changed is not None else None
+            if found is not None:
+                self._timeline.change_rate(found[0])
         return missing
+
+    def _adopt_new_step(self, before: float, newest: int) -> None:
+        """Adopt the new sample rate after most of the recent steps differ from the step ``before``.
+
+        The ``newest`` steps have not been counted yet.
+        """
+        after, rate_hz = self.typical_step.mean_ticks_per_sample, self._timeline.line.rate_hz()
+        if after is None or self._counter.tick_s is None:
+            return
+        counted = self.typical_step.recent[: max(len(self.typical_step.recent) - newest, 0)]
+        self._timeline.false_losses += count_false_losses(counted / before, counted / after)
+        if self._timeline.line.has_enough_points_for_gaps and rate_hz is not None:
+            self._timeline.change_rate(1.0 / (after * self._counter.tick_s))
 
     def _counts_single_samples(self, ticks_per_sample: float | None) -> bool:
         """Return True if steps near the typical step mean that no sample is missing and that the counter works."""
@@ -222,6 +254,13 @@ class _TypicalStep:
     def __init__(self) -> None:
         self._recent: deque[int] = deque(maxlen=STEP_HISTORY)
         self._sum = self._count = 0
+        self.changed = False
+        """True if the newest steps have changed the typical step."""
+
+    @property
+    def recent(self) -> Ints:
+        """Recent steps [n], oldest first."""
+        return np.array(self._recent, np.int64)
 
     @property
     def mean_ticks_per_sample(self) -> float | None:
@@ -230,7 +269,7 @@ class _TypicalStep:
 
     def add_steps(self, steps: Ints) -> bool:
         """Add counter steps to the mean, and return True if all of them are near it. Steps of zero are ignored."""
-        mean = self.mean_ticks_per_sample
+        mean, self.changed = self.mean_ticks_per_sample, False
         if mean is not None and (np.abs(steps / mean - 1.0) < STEP_TOLERANCE).all():
             self._recent.extend(steps[-STEP_HISTORY:].tolist())
             self._add_to_mean(steps)
@@ -241,7 +280,9 @@ class _TypicalStep:
         self._add_to_mean(near)
         if near.size < moved.size:
             recent = np.array(self._recent)
-            if 2 * self._near(recent).size < recent.size:  # start again if most recent steps differ
+            new = recent.size - self._near(recent).size
+            if new >= MIN_NEW_STEPS or (mean is None and 2 * new > recent.size):  # start again
+                self.changed = True
                 self._sum = self._count = 0
                 self._add_to_mean(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
         return False

@@ -9,6 +9,9 @@ of 5 % with a mean burst length of 3 samples, it is four standard deviations.
 from math import log, sqrt
 from typing import Final
 
+import numpy as np
+
+from drivers.data_types import Floats
 from drivers.timing.arrival_regression import ArrivalRegression
 
 MIN_CHANGE: Final = 0.05
@@ -37,6 +40,11 @@ class RateChangeDetector:
     def __init__(self, losses_are_counted: bool) -> None:
         self.losses_are_counted = losses_are_counted
         self.restart()
+
+    @property
+    def steady_rate_hz(self) -> float | None:
+        """Sample rate in Hz before the present windows, which a change that is not yet detected does not affect."""
+        return None if self._before is None else self._before[0]
 
     def restart(self) -> None:
         """Discard both windows."""
@@ -80,3 +88,16 @@ class RateChangeDetector:
         if not self.losses_are_counted:
             limit = max(limit, UNCOUNTED_LOSS_FACTOR / sqrt(index - self._first_index))
         return abs(log(a[0] / b[0])) > limit
+
+
+def count_false_losses(old_periods: Floats, new_periods: Floats) -> int:
+    """Return the number of samples that were counted as missing only because the sample rate had changed.
+
+    Parameters
+    ----------
+    old_periods
+        Time steps [n] in sample periods before the change.
+    new_periods
+        The same time steps in sample periods after the change.
+    """
+    return int(np.maximum(np.rint(old_periods) - np.maximum(np.rint(new_periods), 1.0), 0.0).sum())

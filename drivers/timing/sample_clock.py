@@ -26,7 +26,7 @@ from drivers.timing.arrival_timeline import (
 from drivers.timing.counter_gaps import CounterGaps
 from drivers.timing.duplicate_rows import RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
-from drivers.timing.rate_check import RateCheck
+from drivers.timing.rate_check import AGREEMENT_LIMIT, RateCheck
 from drivers.timing.sender_time_gaps import SenderTimeGapDetector
 from drivers.validation.number_ranges import RATE_HZ
 
@@ -68,7 +68,7 @@ class SampleClock:
         self._arrivals_are_timed = arrivals_are_timed
         self._events = EventRateLimiter()
         self._rows = RowFilter(timing, self._events)
-        self._timeline = ArrivalTimeline(rate_hz)
+        self._timeline = ArrivalTimeline(rate_hz, isinstance(timing, CounterTimedFormat))
         self._counter: CounterGaps | None = None
         self._sender: SenderTimeGapDetector | None = None
         if isinstance(timing, CounterTimedFormat):
@@ -117,7 +117,7 @@ class SampleClock:
             return self._check.rate_hz
         if not self._timeline.line.has_enough_points_for_gaps:
             return self._timeline.assumed_hz
-        measured = self._timeline.line.rate_hz()
+        measured = self._timeline.rate_changes.steady_rate_hz or self._timeline.line.rate_hz()
         return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
 
     @property
@@ -151,6 +151,11 @@ class SampleClock:
     def take_events(self, ended: bool = False) -> list[Event]:
         """Remove and return the queued events. If ``ended`` is True, include all held events."""
         return self._events.take_events(ended)
+
+    def take_false_losses(self) -> int:
+        """Return how many samples were counted as missing since the last call only because the rate had changed."""
+        count, self._timeline.false_losses = self._timeline.false_losses, 0
+        return count
 
     def count_next_gap_by_arrival(self) -> None:
         """Record that the link was closed. The number of missing samples then follows from the next arrival time."""
@@ -204,8 +209,21 @@ class SampleClock:
         stamped = [] if kept is None else self._stamp(kept)
         self._stamped += sum(len(one) for one in stamped)
         self._stamped_s = timeline.seconds_since_origin(int(samples.t_ns[-1]))
+        if timeline.rate_change is not None:
+            self._report_rate_change(*timeline.rate_change, int(samples.t_ns[-1]))
+            timeline.rate_change = None
         self._check_rate()
         return stamped
+
+    def _report_rate_change(self, old_hz: float | None, new_hz: float, t_ns: int) -> None:
+        """Report a change of the sample rate, and compare the new rate with the configured rate at once."""
+        if self._counter is not None:
+            self._counter.restart_device_clock()
+        if self._check is not None:
+            self._check.compare_with_measured_rate(new_hz, AGREEMENT_LIMIT)
+        old = "" if old_hz is None else f"from {old_hz:.4g} Hz "
+        text = f"the sample rate changed {old}to {new_hz:.4g} Hz; the window starts again"
+        self._events.report_event("rate_changed", t_ns, text)
 
     @property
     def _has_device_clock(self) -> bool:

@@ -17,11 +17,16 @@ from drivers.timing.arrival_regression import MIN_SPAN_S
 from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, ArrivalTimeline, retime_and_split_at_gaps
 from drivers.timing.duplicate_rows import SEARCH_ROWS, RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
+from drivers.timing.rate_change import count_false_losses
 
 FORWARD_JUMP_S: Final = 3600.0
 """Forward step of the sender time in s above which a clock jump is reported."""
 STEP_HISTORY: Final = 255
 """Number of recent time steps from which the typical deviation is determined."""
+RATE_CHANGE_STEPS: Final = 16
+"""Number of recent time steps in which a change of the sample rate is detected."""
+MIN_NEW_STEPS: Final = 12
+"""Minimum number of the recent time steps that agree on the new sample period."""
 STEP_TOLERANCE: Final = 0.25
 """Maximum deviation of a time step from a whole number of sample periods, in periods."""
 CERTAIN_GAP_PERIODS: Final = 4.0
@@ -86,6 +91,8 @@ class SenderTimeGapDetector:
             self._report_jumps(t, steps)
             jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S))
         period_s = self._period_s(steps)
+        if period_s and not jumps.size:
+            period_s = self._adopt_new_period(steps, period_s)
         missing = self._count_missing(steps / NS_PER_S, period_s) if period_s else np.zeros(len(samples), np.int64)
         missing[0] = max(int(missing[0]), samples.lost)
         index = timeline.index + np.cumsum(missing + 1)
@@ -95,10 +102,25 @@ class SenderTimeGapDetector:
             timeline.restart_line()
         for row in (first, len(samples) - 1):
             timeline.line.add_point(float(index[row]), timeline.seconds_since_origin(int(t[row])))
+        timeline.find_rate_change(float(index[-1]), timeline.seconds_since_origin(int(t[-1])))
         timeline.index, timeline.last_t_ns = float(index[-1]), int(t[-1])
         if period_s:
             self._keep_missing_times(t, missing, period_s)
         return retime_and_split_at_gaps(samples, t, missing)
+
+    def _adopt_new_period(self, steps: Ints, period_s: float) -> float:
+        """Return the sample period in s, which changes if most of the recent time steps agree on another period."""
+        timeline = self._timeline
+        recent = np.concatenate([np.array(self._steps_s), steps / NS_PER_S])[-RATE_CHANGE_STEPS:]
+        new_s = float(np.median(recent))
+        near = np.count_nonzero(np.abs(recent / new_s - 1.0) < STEP_TOLERANCE) if new_s > 0.0 else 0
+        regular = recent.size == RATE_CHANGE_STEPS and near >= MIN_NEW_STEPS
+        if not regular or abs(new_s / period_s - 1.0) < STEP_TOLERANCE or not timeline.line.has_enough_points_for_gaps:
+            return period_s
+        counted = recent[: max(recent.size - len(steps), 0)]
+        self._timeline.false_losses += count_false_losses(counted / period_s, counted / new_s)
+        timeline.change_rate(1.0 / new_s)
+        return new_s
 
     def _remove_late_rows(self, samples: SampleBlock, period_s: float) -> SampleBlock | None:
         """Remove samples that were already counted as missing. Return None if no sample remains."""

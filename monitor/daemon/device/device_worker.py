@@ -253,6 +253,8 @@ class DeviceWorker:
         blocks = self._take() if drain or self._can_take() else []
         events = self.timeline.take_events() + events  # the time of the first sample is known now
         self.pipeline.process_blocks(blocks, self.clock.configured_or_measured_rate_hz, drain)
+        if any(event.kind == "rate_changed" for event in events):
+            self.pipeline.restart_at_new_rate()
         if drain:
             self.pipeline.process_samples_held_by_motion_detector()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):

@@ -198,6 +198,13 @@ class DevicePipeline:
             self.estimator.empty_window()
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
+    def restart_at_new_rate(self) -> None:
+        """Discard all samples and models after a change of the sample rate. The next samples create new stages."""
+        self.estimator = self.motion_and_change_monitor = self.thermal = self.compensation = None
+        self.noise_model_comparator, self._temperatures = None, None
+        self.refusal_reason, self._handled = "", 0
+        self.since_ns = [self.newest_ns + 1] * len(AXES)
+
     def refine_rate(self, rate_hz: float) -> None:
         """Replace the sample rate of all stages by a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:

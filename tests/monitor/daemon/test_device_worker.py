@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.data_types import concatenate_blocks, make_block
+from drivers.data_types import Event, concatenate_blocks, make_block
 from drivers.decoders import dbc
 from drivers.decoders.binary_frames import vectornav_binary
 from drivers.decoders.messages import samples
@@ -850,3 +850,23 @@ def test_slow_statistics_of_a_rebuilt_window_have_the_time_of_the_window(tmp_pat
         if harness.output.totals:
             break
     assert harness.output.total_times[:1] == [4.99]
+
+
+def test_changed_rate_starts_the_window_again_and_withholds_the_coefficients():
+    harness = WorkerHarness()
+    for i in range(20):
+        harness.push_samples(50)
+        harness.process(1000.0 + 0.1 * i)
+    worker = harness.worker
+    assert worker.pipeline.estimator.samples_in_window == 1000
+    worker.driver._events.append(Event("rate_changed", worker.pipeline.newest_ns, "from 100 Hz to 50 Hz"))
+    worker.clock._check.compare_with_measured_rate(50.0, 0.005)
+    harness.process(1002.0)
+    harness.push_samples(200)
+    harness.process(1003.0)
+    estimator = worker.pipeline.estimator
+    assert (estimator.rate_hz, estimator.samples_in_window, estimator.window_s) == (50.0, 200, 20.0)
+    assert [event.kind for _, event in harness.output.events] == ["rate_changed"]
+    _, last = harness.output.estimates[-1]
+    assert last.samples == 200
+    assert (last.coefficients.status == Status.UNESTIMATED).all()

@@ -1,0 +1,76 @@
+"""Tests of a sample rate that changes while the samples arrive, for each source of the sample times."""
+
+import numpy as np
+import pytest
+
+from drivers.data_types import NS_PER_S, ArrivalTimedFormat, CounterTimedFormat, SenderTimedFormat, Timing, make_block
+from drivers.timing.sample_clock import SampleClock
+
+START_S = 1e5
+CHANGE_S = 30.0
+SENSORS = {
+    "no counter": ArrivalTimedFormat(),
+    "device clock": CounterTimedFormat(1 << 62, 1e-9),
+    "16-bit counter": CounterTimedFormat(1 << 16),
+    "sender times": SenderTimedFormat(),
+}
+
+
+def run(timing: Timing, configured: bool, new_hz: float) -> tuple[SampleClock, list, set, int]:
+    """Return the clock, the events with their delays in s, the rates in use after 10 s, and the lost samples."""
+    rng = np.random.default_rng(3)
+    taken_s = np.concatenate([np.arange(0.0, CHANGE_S, 0.01), CHANGE_S + np.arange(round(20.0 * new_hz)) / new_hz])
+    arrived_s = np.maximum.accumulate(np.ceil((taken_s + rng.uniform(0.0, 0.005, taken_s.size)) / 0.02) * 0.02)
+    clock = SampleClock(timing, 100.0 if configured else None)
+    events, rates, lost = [], set(), 0
+    for index in np.split(np.arange(taken_s.size), np.flatnonzero(np.diff(arrived_s)) + 1):
+        ticks = None
+        if isinstance(timing, CounterTimedFormat):
+            ticks = np.rint(taken_s[index] * 1e9).astype(np.int64) if timing.tick_s else index % timing.modulus
+        t_s = taken_s[index] if isinstance(timing, SenderTimedFormat) else arrived_s[index]
+        t_ns = np.rint((START_S + t_s) * NS_PER_S).astype(np.int64)
+        blocks = clock.assign_times(make_block(t_ns, np.repeat(index[:, None] * 1e-3, 6, axis=1), None, ticks))
+        lost += sum(block.lost for block in blocks) - clock.take_false_losses()
+        now_s = float(arrived_s[index[-1]])
+        events += [(event.kind, now_s - CHANGE_S) for event in clock.take_events()]
+        if now_s > 10.0:
+            rates.add((clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz is not None))
+    return clock, events, rates, lost
+
+
+@pytest.mark.parametrize("new_hz", [10.0, 50.0, 200.0])
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize("timing", SENSORS.values(), ids=SENSORS)
+def test_changed_rate_is_reported_once_within_seconds(timing: Timing, configured: bool, new_hz: float) -> None:
+    _, events, rates, lost = run(timing, configured, new_hz)
+    assert [kind for kind, _ in events] == ["rate_changed"]
+    assert 0.0 < events[0][1] < 6.5
+    assert rates == {(100.0, False), (new_hz, configured)}  # no rate in between
+    assert lost == 0
+
+
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize("timing", SENSORS.values(), ids=SENSORS)
+def test_rate_within_the_tolerance_of_an_oscillator_has_not_changed(timing: Timing, configured: bool) -> None:
+    clock, events, _, lost = run(timing, configured, 99.0)
+    assert events == []
+    assert lost == 0
+    assert clock.contradicting_rate_hz is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(4))
+def test_losses_jitter_and_stalls_are_no_change_of_the_rate(seed: int) -> None:
+    """Two hours of samples of which 5 % are lost, read every 100 ms, with 36 stalls of up to 1 s per hour."""
+    rng = np.random.default_rng(seed)
+    taken_s = np.arange(720_000) / 100.0
+    taken_s = taken_s[rng.random(taken_s.size) > 0.05]
+    arrived_s = taken_s + rng.uniform(0.0, 0.01, taken_s.size)
+    for begun_s in rng.uniform(0.0, taken_s[-1], 72):
+        ended_s = begun_s + rng.uniform(0.0, 1.0)
+        arrived_s[(arrived_s > begun_s) & (arrived_s < ended_s)] = ended_s
+    arrived_s = np.maximum.accumulate(np.ceil(arrived_s / 0.1) * 0.1)
+    clock = SampleClock(ArrivalTimedFormat(), None)
+    for t_s in np.split(arrived_s, np.flatnonzero(np.diff(arrived_s)) + 1):
+        clock.assign_times(make_block(np.rint((START_S + t_s) * NS_PER_S).astype(np.int64), np.zeros((t_s.size, 6))))
+    assert clock.take_events() == []
