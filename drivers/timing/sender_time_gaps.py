@@ -91,7 +91,7 @@ class SenderTimeGapDetector:
             self._report_jumps(t, steps)
             jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S))
         period_s = self._period_s(steps)
-        if period_s and not jumps.size:
+        if period_s and not jumps.size and abs(steps[-1] / NS_PER_S / period_s - 1.0) > STEP_TOLERANCE:
             period_s = self._adopt_new_period(steps, period_s)
         missing = self._count_missing(steps / NS_PER_S, period_s) if period_s else np.zeros(len(samples), np.int64)
         missing[0] = max(int(missing[0]), samples.lost)
