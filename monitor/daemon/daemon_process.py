@@ -139,8 +139,9 @@ class DaemonProcess:
             if self._reload_asked and self._config_reader is None:
                 self._reload_asked = False
                 self._begin_reload()
-            if self._config_change is not None:
-                self._config_reader, self._config_change, change = None, None, self._config_change
+            change = self._config_change
+            if change is not None:
+                self._config_reader = self._config_change = None
                 self._finish_reload(change)
             self._wait(now_s)
 
