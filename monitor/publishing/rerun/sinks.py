@@ -28,6 +28,9 @@ from pathlib import Path
 from typing import IO, Final
 from urllib.parse import quote
 
+# Rerun reads this variable while it is imported. The warning about a missing footer says nothing to the user.
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
+
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
