@@ -271,14 +271,14 @@ class TestMemory:
     @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap-chunk"])
     def test_a_longer_bag_needs_no_more_memory(self, kind: str, tmp_path: Path) -> None:
         peaks = []
-        for n in (4_000, 16_000):
+        for n in (8_000, 32_000):
             path = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(n), noise(n))}, f"run{n}")
             tracemalloc.start()
             with ros_bag_format._open_bag(path) as (bag, _):
                 assert sum(1 for _ in bag.messages(bag.connections)) == n
             peaks.append(tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
-        assert peaks[1] - peaks[0] < 50_000  # 4 bytes per message
+        assert peaks[1] - peaks[0] < 100_000  # 4 bytes per message
 
     @pytest.mark.parametrize("kind", ["ros1-bz2", "ros1-lz4", "mcap-chunk", "sqlite-message", "mcap-message"])
     def test_messages_that_unpack_to_more_than_the_limit(
