@@ -173,12 +173,12 @@ def _add_run(
 
 
 @inlined
-def wrap_count(count: int) -> int:
+def wrap_count(count: int | np.int64) -> int:
     """Return a count of missing samples, or a difference of two counts, modulo 2³² in the range of int32.
 
     Differences of counts within a window are below 2³¹, so they are exact although the counts wrap around.
     """
-    return ((count + (1 << 31)) & ((1 << 32) - 1)) - (1 << 31)
+    return int(((count + (1 << 31)) & ((1 << 32) - 1)) - (1 << 31))
 
 
 @compiled
@@ -193,7 +193,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             step = np.rint(y)
             scaling[LANES + lane] = y - step
             phase[now + lane] = phase[before + lane] + np.int64(step)
-            count = np.int64(missing[before + lane])
+            count = int(missing[before + lane])
         else:
             phase[now + lane] = phase[before + lane]
             count = wrap_count(np.int64(missing[before + lane]) + 1)
