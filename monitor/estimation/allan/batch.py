@@ -3,14 +3,16 @@
 The results serve as a reference for ``AllanWindow``, which uses integer arithmetic. Three measures keep the precision
 for 10⁷ samples and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
 
-- Missing samples divide the recording into runs of consecutive samples. The mean of a run is subtracted from its
-  samples. The subtraction is exact if the noise is small compared with the mean (Sterbenz).
+- The mean of the recording is subtracted from the samples. The subtraction is exact if the noise is small compared with
+  the mean (Sterbenz).
 - Phase is the running sum of the rates after subtraction of the mean. The rounding errors of the running sum are summed
   separately and added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005).
 - The squared differences are accumulated in ``LANES`` separate sums, which NumPy then adds pairwise.
 
 Compared with exact integer arithmetic, the relative error of the Allan variance is 1e-15 for stationary noise and 1e-12
 for random walk. For a linear drift over 20 000 times the noise, the relative error is 1e-10.
+
+Clusters with missing samples are treated as described in ``missing_samples``.
 
 The compiled code releases the GIL, so ``overlapping_avar(values, factors, map_axes=pool.map)`` computes the axes in
 parallel. The samples are processed in blocks that fit the processor cache. Each block is read once for all τ, because
@@ -21,18 +23,22 @@ from collections.abc import Callable, Iterable
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
 from monitor.common.compiled import as_read_only, compiled
+from monitor.estimation.allan.missing_samples import (
+    AllanVariances,
+    min_present,
+    subtract_excess,
+    variance_within_clusters,
+)
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
 """Averaging times: the name of a predefined grid, or a tuple of times in seconds."""
 
-Column = tuple[Floats, Ints]
-"""Allan variance [m] of one axis, and the number of averaged second differences [m]."""
-
-EachAxis = Callable[[Callable[[Floats], Column], Iterable[Floats]], Iterable[Column]]
+EachAxis = Callable[[Callable[[Floats], AllanVariances], Iterable[Floats]], Iterable[AllanVariances]]
 """Type of the built-in function ``map`` and of the method ``map`` of a thread pool."""
 
 MIN_PRESENT_SHARE: Final = 0.98
@@ -47,8 +53,8 @@ def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) ->
     """Return the overlapping Allan variance of rates, and the number of averaged second differences.
 
     According to NIST SP 1065 eq. 11, σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase, and C is the
-    number of second differences. The unit of time is the sample interval. Second differences that contain a missing
-    sample are left out.
+    number of second differences. The unit of time is the sample interval. For clusters with missing samples, see
+    ``overlapping_allan_variances``.
 
     Parameters
     ----------
@@ -62,42 +68,56 @@ def overlapping_avar(values: Floats, factors: Ints, map_axes: EachAxis = map) ->
     Returns
     -------
     avar : ndarray of float64, shape (m, k)
-        Allan variance in squared units of the axis; NaN if every second difference contains a missing sample.
+        Allan variance in squared units of the axis; NaN if too many samples are missing.
     terms : ndarray of int64, shape (m, k)
         Number of averaged second differences.
 
     >>> overlapping_avar(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
-    columns = list(map_axes(lambda column: overlapping_avar_axis(column, factors), values.T))
-    return np.stack([avar for avar, _ in columns], axis=1), np.stack([terms for _, terms in columns], axis=1)
+    avar, terms, _ = overlapping_allan_variances(values, factors, map_axes)
+    return np.maximum(avar, 0.0), terms
 
 
-def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
-    """Return the overlapping Allan variance of one axis, and the number of averaged second differences.
+def overlapping_avar_axis(rate: Floats, factors: Ints) -> tuple[Floats, Ints]:
+    """Return the results of ``overlapping_avar`` for the rates [n] of one axis."""
+    avar, terms, _ = _allan_variances_of_axis(rate, factors)
+    return np.maximum(avar, 0.0), terms
 
-    Parameters
-    ----------
-    rate : ndarray of float, shape (n,)
-        Rates of the axis; non-finite values mean missing samples.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
 
-    Returns
-    -------
-    avar : ndarray of float64, shape (m,)
-        Allan variance.
-    terms : ndarray of int64, shape (m,)
-        Number of averaged second differences.
+def overlapping_allan_variances(values: Floats, factors: Ints, map_axes: EachAxis = map) -> AllanVariances:
+    """Return the overlapping Allan variances of rates, corrected for missing samples.
+
+    The method is described in ``missing_samples``. The parameters are those of ``overlapping_avar``. The corrected
+    Allan variance is unbiased. It may be negative if missing samples contribute most of the mean square.
     """
+    columns = list(map_axes(lambda column: _allan_variances_of_axis(column, factors), values.T))
+    return AllanVariances(*(np.stack(parts, axis=1) for parts in zip(*columns, strict=True)))
+
+
+def _allan_variances_of_axis(rate: Floats, factors: Ints) -> AllanVariances:
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0
     phase[1:] = rate  # copied to float64, because sums in float32 would be too inaccurate
+    absent = ~np.isfinite(phase)
     m = np.ascontiguousarray(factors, np.int64)
-    lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
-    _add_runs(phase, m, lanes, terms)
-    with np.errstate(invalid="ignore"):  # 0/0 if no second difference is complete
-        return lanes.sum(axis=1) / (2.0 * m * m * terms), terms
+    if not absent.any():
+        lanes, terms = np.zeros((m.size, LANES)), np.zeros(m.size, np.int64)
+        _integrate(phase)
+        _add_complete(phase, m, lanes, terms)
+        with np.errstate(invalid="ignore"):  # 0/0 if no second difference exists
+            return AllanVariances(lanes.sum(axis=1) / (2.0 * m * m * terms), terms, np.zeros(m.size))
+    missing = np.cumsum(absent, dtype=np.int32)
+    within = variance_within_clusters(m, np.full(m.size, len(rate)))
+    all_m = within.factors
+    lanes, extra, terms = *np.zeros((2, all_m.size, LANES)), np.zeros(all_m.size, np.int64)
+    _integrate(phase)
+    _add_with_missing(phase, missing, all_m, lanes, extra, terms)
+    with np.errstate(invalid="ignore"):  # 0/0 if no second difference counts
+        avar, share = lanes.sum(axis=1) / (2.0 * all_m * all_m * terms), extra.sum(axis=1) / (2.0 * terms)
+    excess = np.empty(all_m.size)
+    subtract_excess(all_m, within.order, within.first, within.weights, share, avar, excess)
+    return AllanVariances(avar[: m.size], terms[: m.size], excess[: m.size])
 
 
 def rate_slope_from_thirds(values: Floats) -> Floats:
@@ -243,39 +263,52 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
 
 
 @compiled
-def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
-    """Convert the rates in ``phase[1:]`` to phase, and add the squared second differences to ``lanes``."""
-    before = 0
-    while before + 1 < phase.size:
-        last = _integrate(phase, before)
-        for begin in range(before, last + 1, BLOCK):
-            end = min(begin + BLOCK, last + 1)
-            for i in range(factors.size):
-                first = max(begin, before + 2 * factors[i])
-                if first < end:
-                    terms[i] += end - first
-                    _add_squares(phase, first, end, factors[i], lanes[i])
-        before = last + 1
+def _add_complete(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
+    """Add all squared second differences of phase to ``lanes``."""
+    for begin in range(0, phase.size, BLOCK):
+        end = min(begin + BLOCK, phase.size)
+        for i in range(factors.size):
+            first = max(begin, 2 * factors[i])
+            if first < end:
+                terms[i] += end - first
+                _add_squares(phase, first, end, factors[i], lanes[i])
 
 
 @compiled
-def _integrate(phase: Floats, before: int) -> int:
-    """Convert the finite rates that follow index ``before`` to phase, and return the index of the last one."""
-    total, last = 0.0, before
-    while last + 1 < phase.size and np.isfinite(phase[last + 1]):
-        last += 1
-        total += phase[last]
-    mean = total / max(last - before, 1)
+def _add_with_missing(
+    phase: Floats, missing: NDArray[np.int32], factors: Ints, lanes: Floats, extra: Floats, terms: Ints
+) -> None:
+    """Add the squared differences that count to ``lanes``, and their values m/n_A + m/n_B − 2 to ``extra``."""
+    for begin in range(0, phase.size, BLOCK):
+        end = min(begin + BLOCK, phase.size)
+        for i in range(factors.size):
+            first = max(begin, 2 * factors[i])
+            if first >= end:
+                continue
+            if missing[first - 2 * factors[i]] == missing[end - 1]:
+                terms[i] += end - first
+                _add_squares(phase, first, end, factors[i], lanes[i])
+            else:
+                terms[i] += _add_incomplete(phase, missing, first, end, factors[i], lanes[i], extra[i])
+
+
+@compiled
+def _integrate(phase: Floats) -> None:
+    """Convert the rates that follow ``phase[0]`` to phase. A missing sample does not change the phase."""
+    total, count = 0.0, 0
+    for i in range(1, phase.size):
+        if np.isfinite(phase[i]):
+            total += phase[i]
+            count += 1
+    mean = total / max(count, 1)
     total, rest = 0.0, 0.0
-    phase[before] = 0.0
-    for i in range(before + 1, last + 1):
-        step = phase[i] - mean
+    for i in range(1, phase.size):
+        step = phase[i] - mean if np.isfinite(phase[i]) else 0.0
         longer = total + step
         back = longer - total
         rest += (total - (longer - back)) + (step - back)
         total = longer
         phase[i] = total + rest
-    return last
 
 
 @compiled
@@ -289,3 +322,25 @@ def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> 
         for lane in range(np.uintp(min(LANES, end - row))):
             d = (phase[at0 + lane] - phase[at1 + lane]) - (phase[at1 + lane] - phase[at2 + lane])
             lanes[lane] += d * d
+
+
+@compiled
+def _add_incomplete(
+    phase: Floats, missing: NDArray[np.int32], first: int, end: int, m: int, lanes: Floats, extra: Floats
+) -> int:
+    """Add the squares of the differences first ≤ i < end that count, and return their number."""
+    most, count = m - min_present(m), 0
+    for row in range(first, end, LANES):
+        at0, at1, at2 = np.uintp(row), np.uintp(row - m), np.uintp(row - 2 * m)
+        for lane in range(np.uintp(min(LANES, end - row))):
+            older = missing[at1 + lane] - missing[at2 + lane]
+            newer = missing[at0 + lane] - missing[at1 + lane]
+            if older <= most and newer <= most:
+                # the difference of the sums, and what the missing samples would add to both sums
+                a, b = older / (m - older), newer / (m - newer)
+                sum_a, sum_b = phase[at1 + lane] - phase[at2 + lane], phase[at0 + lane] - phase[at1 + lane]
+                d = (sum_b - sum_a) + (sum_b * b - sum_a * a)
+                lanes[lane] += d * d
+                extra[lane] += a + b
+                count += 1
+    return count

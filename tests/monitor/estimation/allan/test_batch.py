@@ -3,6 +3,7 @@
 import csv
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
+from itertools import product
 
 import allantools
 import numpy as np
@@ -13,11 +14,12 @@ from monitor.estimation.allan.batch import (
     BLOCK,
     LANES,
     cluster_sizes,
+    overlapping_allan_variances,
     overlapping_avar,
     overlapping_avar_axis,
     rate_slope_from_thirds,
 )
-from tests.support.allan_references import columns, nist_1000
+from tests.support.allan_references import avar_with_gaps, columns, mean_squares_with_gaps, nist_1000
 
 
 def compute_deviations(y, factors):
@@ -45,27 +47,96 @@ def test_deviations_equal_allantools(seed, offset):
     assert (terms > 0).all()
 
 
-def test_terms_with_missing_samples_are_left_out():
-    rng = np.random.default_rng(1)
-    y = rng.standard_normal((60, 2)) + 5.0
-    y[[7, 30, 31, 59], 0] = np.nan
-    y[:, 1] = np.nan
-    for m in (1, 2, 5, 11):
-        squares = []
-        for k in range(60 - 2 * m + 1):
-            span = y[k : k + 2 * m, 0]
-            if not np.isnan(span).any():
-                squares.append((span[m:].mean() - span[:m].mean()) ** 2)
-        avar, terms = overlapping_avar(y, np.array([m]))
-        assert terms.tolist() == [[len(squares), 0]]
-        assert avar[0, 0] == pytest.approx(0.5 * np.mean(squares), rel=1e-12)
-        assert np.isnan(avar[0, 1])
+@pytest.mark.parametrize(
+    ("loss", "burst", "factors"),
+    [
+        (0.05, 1, [1, 2, 4, 8, 16, 32, 64, 128]),
+        (0.2, 1, [1, 2, 3, 5, 7, 10, 50, 100]),  # the sizes 4 and 8 are missing, so all powers of two are added
+        (0.1, 12, [100]),
+        (0.02, 40, [3, 30, 250]),
+    ],
+)
+def test_clusters_with_missing_samples_equal_the_definition(loss, burst, factors):
+    rng = np.random.default_rng(burst)
+    y = rng.standard_normal((500, 3)) + 0.1 * np.cumsum(rng.standard_normal((500, 3)), axis=0) + 5.0
+    for axis in range(2):
+        for begin in rng.integers(0, 500, round(500 * loss / burst)):
+            y[begin : begin + burst, axis] = np.nan
+    y[:, 2] = np.nan
+    avar, terms, excess = overlapping_allan_variances(y, np.array(factors))
+    for i, m in enumerate(factors):
+        for axis in range(2):
+            raw, count, _ = mean_squares_with_gaps(y[:, axis], m)
+            assert terms[i, axis] == count
+            assert avar[i, axis] + excess[i, axis] == pytest.approx(raw, rel=1e-11)
+            assert avar[i, axis] == pytest.approx(avar_with_gaps(y[:, axis], m), rel=1e-11)
+    assert not terms[:, 2].any()
+    assert np.isnan(avar[:, 2]).all()
 
 
-def compute_avar_exactly(y, factors):
-    """Compute the variance without rounding, with Python integers in units of the finest double.
+def test_interpolated_octaves_hardly_change_the_result():
+    """A grid of ten sizes per decade contains no powers of two above 32."""
+    rng = np.random.default_rng(2)
+    y = rng.standard_normal(3000) + 0.05 * np.cumsum(rng.standard_normal(3000))
+    y[rng.random(3000) < 0.1] = np.nan
+    factors = cluster_sizes(3000, 1.0, "decade10")
+    avar, _, excess = overlapping_allan_variances(y[:, None], factors)
+    octaves = 2 ** np.arange(10)
+    expected, _, wanted = overlapping_allan_variances(y[:, None], np.union1d(factors, octaves))
+    at = np.searchsorted(np.union1d(factors, octaves), factors)
+    assert excess[:, 0] == pytest.approx(wanted[at, 0], rel=0.02)
+    assert avar[:, 0] == pytest.approx(expected[at, 0], rel=2e-3)
 
-    Terms that contain a sample that is not finite are left out.
+
+@pytest.mark.parametrize(
+    ("noise", "loss"),
+    [
+        *product(["white", "random walk"], ["random", "bursts", "every 50th"]),
+        *product(
+            ["quantization"], ["random", "every 50th"]
+        ),  # biased under bursts, see docs/explanation/missing-samples
+    ],
+)
+def test_missing_samples_cause_no_bias(noise, loss):
+    """Without the correction, the bias of white and quantization noise is 10 to 100 standard errors of the mean."""
+    rng, n, records = np.random.default_rng(3), 2048, 400
+    white = rng.standard_normal((n + 1, records))
+    y = {"white": white[1:], "random walk": np.cumsum(white[1:], axis=0), "quantization": np.diff(white, axis=0)}[noise]
+    factors = 2 ** np.arange(9)
+    complete, _ = overlapping_avar(y, factors)
+    present = np.ones(y.shape, bool)
+    if loss == "random":
+        present = rng.random(y.shape) >= 0.05
+    elif loss == "every 50th":
+        present[::50] = False
+    else:
+        for axis in range(records):
+            for begin in rng.integers(0, n, 10):
+                present[begin : begin + 10, axis] = False
+    avar, _, _ = overlapping_allan_variances(np.where(present, y, np.nan), factors)
+    change = avar - complete
+    error = change.std(axis=1) / records**0.5
+    assert (np.abs(change.mean(axis=1)) < np.maximum(4.0 * error, 0.1 * complete.std(axis=1))).all()
+
+
+def test_offset_and_ramp_cancel_in_clusters_with_missing_samples():
+    rng, factors = np.random.default_rng(4), 2 ** np.arange(11)
+    y = 1e-3 * rng.standard_normal((20_000, 1))
+    y[rng.random(len(y)) < 0.05] = np.nan
+    plain, terms, _ = overlapping_allan_variances(y, factors)
+    offset, _, _ = overlapping_allan_variances(y + 9.81, factors)
+    assert offset == pytest.approx(plain, rel=1e-10)
+    slope = 1e-6
+    ramp, _, _ = overlapping_allan_variances(y + slope * np.arange(20_000.0)[:, None], factors)
+    rise = (ramp - plain)[-2:, 0]
+    assert rise == pytest.approx(0.5 * (slope * factors[-2:]) ** 2, rel=0.15)
+    assert (terms > 0).all()
+
+
+def compute_mean_squares_exactly(y, factors):
+    """Compute half the mean square of the differences that count without rounding, with Python integers.
+
+    The unit is the finest double. The squares are summed separately for each pair of sample counts.
     """
     parts = [Fraction(float(v)) if np.isfinite(v) else None for v in y]
     unit = max(part.denominator for part in parts if part is not None)
@@ -75,9 +146,15 @@ def compute_avar_exactly(y, factors):
         gaps.append(gaps[-1] + (part is None))
     found = []
     for m in map(int, factors):
-        whole = [k for k in range(2 * m, len(phase)) if gaps[k] == gaps[k - 2 * m]]
-        total = sum((phase[k] - 2 * phase[k - m] + phase[k - 2 * m]) ** 2 for k in whole)
-        found.append(float(Fraction(total, 2 * m * m * unit * unit * len(whole))))
+        sums, count = {}, 0
+        for k in range(2 * m, len(phase)):
+            older, newer = m - (gaps[k - m] - gaps[k - 2 * m]), m - (gaps[k] - gaps[k - m])
+            if 5 * min(older, newer) >= 3 * m:
+                d = (phase[k] - phase[k - m]) * older - (phase[k - m] - phase[k - 2 * m]) * newer
+                sums[older * newer] = sums.get(older * newer, 0) + d * d
+                count += 1
+        total = sum(Fraction(total, shares * shares) for shares, total in sums.items())
+        found.append(float(total / (2 * unit * unit * count)))
     return found
 
 
@@ -101,7 +178,7 @@ def test_avar_equals_a_sum_without_rounding(added, within):
     y = simulate_random_walk(np.random.default_rng(3), n) + added(n)
     factors = np.array([1, 2, 3, 7, 64, 1000, 3000, 6000])
     avar, terms = overlapping_avar_axis(y, factors)
-    assert avar == pytest.approx(compute_avar_exactly(y, factors), rel=within)
+    assert avar == pytest.approx(compute_mean_squares_exactly(y, factors), rel=within)
     assert terms.tolist() == (n + 1 - 2 * factors).tolist()
 
 
@@ -112,9 +189,24 @@ def test_gaps_in_a_long_recording_leave_the_sum_exact():
     y[rng.integers(0, n, 5)] = np.nan
     y[[0, n - 1, BLOCK - 1, BLOCK, BLOCK + 1]] = [np.inf, -np.inf, np.nan, np.nan, np.nan]
     factors = np.array([1, 5, 100, 700])
-    avar, terms = overlapping_avar_axis(y, factors)
-    assert avar == pytest.approx(compute_avar_exactly(y, factors), rel=1e-14)
+    avar, terms, excess = overlapping_allan_variances(y[:, None], factors)
+    assert (avar + excess)[:, 0] == pytest.approx(compute_mean_squares_exactly(y, factors), rel=1e-14)
     assert (terms > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("added", "within"),
+    [(lambda n: 9.81, 1e-12), (lambda n: np.linspace(8.81, 10.81, n), 1e-9)],  # 20 000 times the noise
+    ids=["gravity", "steep ramp"],
+)
+def test_random_loss_keeps_the_precision(added, within):
+    n = 12_000
+    rng = np.random.default_rng(8)
+    y = simulate_random_walk(rng, n) + added(n)
+    y[rng.random(n) < 0.1] = np.nan
+    factors = np.array([1, 4, 7, 64, 1000, 5000])
+    avar, _, excess = overlapping_allan_variances(y[:, None], factors)
+    assert (avar + excess)[:, 0] == pytest.approx(compute_mean_squares_exactly(y, factors), rel=within)
 
 
 @pytest.mark.parametrize("n", [BLOCK - 1, BLOCK, 2 * BLOCK, 2 * BLOCK + 1, 3 * BLOCK + LANES - 1])

@@ -1,0 +1,146 @@
+"""Allan variance of records with missing samples: which differences count, and correction of the bias.
+
+Let two adjacent clusters of m samples contain n_A and n_B samples that are present. The difference of their means counts
+if both clusters contain at least ``MIN_PRESENT_SHARE`` of their samples. The mean of the present samples differs from
+the mean of the cluster like the mean of a sample that is drawn without replacement (Cochran, Sampling Techniques,
+theorem 2.2). Half the mean square of the counted differences is therefore too large by e V(m), where
+
+    e = mean of ½ (1/n_A + 1/n_B) − 1/m,    V(m) = mean variance of the samples within a cluster (divisor m − 1).
+
+V is the sum of the Allan variances of all shorter clusters of 1, 2, 4, … samples:
+
+    V(2^J) = 2^J / (2^J − 1) · Σ_{j<J} σ²(2^j) / 2.
+
+The page ``docs/explanation/missing-samples.md`` derives both formulas and says where they cease to hold.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.data_types import Floats, Ints
+from monitor.common.compiled import compiled, inlined
+
+MIN_PRESENT_SHARE: Final = 0.6
+"""Minimum share of the samples of each cluster that must be present. ``min_present`` computes with exact integers.
+
+If 20 % of the samples are missing at random, nearly all clusters of 8 and more samples reach this share.
+"""
+
+
+class AllanVariances(NamedTuple):
+    """Overlapping Allan variance at m cluster sizes, for one axis or k axes."""
+
+    avar: Floats  # [m] or [m, k] squared units of the axis; NaN if too many samples are missing; may be ≤ 0 under loss
+    terms: Ints  # [m] or [m, k] number of counted second differences
+    excess: Floats  # [m] or [m, k] contribution of missing samples to the mean square, already subtracted from ``avar``
+
+
+class VarianceWithinClusters(NamedTuple):
+    """Linear map from the Allan variances at R cluster sizes to the variance V within the clusters.
+
+    Rows and columns of ``weights`` are in the order ``order``.
+    """
+
+    factors: Ints  # [R] given cluster sizes, followed by added powers of two
+    spans: Ints  # [R] number of samples that are used at each cluster size
+    order: Ints  # [R] indices of the cluster sizes, ascending in each grid
+    first: Ints  # [R] position of the first cluster size of the same grid
+    weights: Floats  # [R, R] lower triangular matrix, zero outside the grids
+
+
+@inlined
+def min_present(m: int) -> int:
+    """Return the minimum number of present samples in a cluster of m samples, which is ⌈0.6 m⌉."""
+    return (3 * m + 4) // 5
+
+
+def variance_within_clusters(factors: Ints, spans: Ints) -> VarianceWithinClusters:
+    """Return the linear map from Allan variances to the variance within clusters.
+
+    Each sequence of ascending cluster sizes is a grid of its own. If a grid does not begin with 1, or if a cluster size
+    is more than twice its predecessor, the missing powers of two are added.
+
+    The Allan variance at a power of two that is not in the grid is interpolated: m σ²(m) is linear in log m. The
+    variance within clusters of another size is interpolated between powers of two.
+
+    Parameters
+    ----------
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    spans : ndarray of int64, shape (m,)
+        Number of samples that are used at each cluster size. An added size gets the span of the next larger size.
+
+    >>> v = variance_within_clusters(np.array([1, 2, 4, 3]), np.full(4, 90))
+    >>> v.factors.tolist(), v.order.tolist()
+    ([1, 2, 4, 3, 1, 2], [0, 1, 2, 4, 5, 3])
+    >>> (v.weights @ (1.0 / v.factors[v.order])).round(12).tolist()  # white noise
+    [0.0, 1.0, 1.0, 0.0, 1.0, 1.0]
+    """
+    edges = [0, *(np.flatnonzero(np.diff(factors) <= 0) + 1).tolist(), factors.size]
+    order, first, parts = [], [], []
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        own, rows = factors[begin:end], np.arange(begin, end)
+        if own[0] > 1 or (own[1:] > 2 * own[:-1]).any():
+            octaves = np.setdiff1d(2 ** np.arange(int(own[-1] - 1).bit_length(), dtype=np.int64), own)
+            rows = np.concatenate([rows, factors.size + np.arange(octaves.size)])
+            spans = np.concatenate([spans, spans[begin:end][np.searchsorted(own, octaves)]])
+            factors = np.concatenate([factors, octaves])
+        rows = rows[np.argsort(factors[rows])]
+        first.append(np.full(rows.size, sum(one.size for one in order)))
+        order.append(rows)
+        parts.append(_weights_of_grid(factors[rows].astype(np.float64)))
+    weights = np.zeros((factors.size, factors.size))
+    for at, part in zip(first, parts, strict=True):
+        weights[at[0] : at[0] + at.size, at[0] : at[0] + at.size] = part
+    return VarianceWithinClusters(factors, spans, np.concatenate(order), np.concatenate(first), weights)
+
+
+def _weights_of_grid(m: Floats) -> Floats:
+    log_m = np.log2(m)
+    log_octaves = np.arange(np.ceil(log_m[-1]) + 1.0)
+    octaves = np.exp2(log_octaves)
+    # the rows are octaves, the columns are cluster sizes
+    allan = np.stack([np.interp(log_octaves, log_m, m * one) for one in np.eye(m.size)], axis=1) / octaves[:, None]
+    below = 0.5 * (np.cumsum(allan, axis=0) - allan)  # sum over the shorter octaves
+    within = below * (octaves / np.maximum(octaves - 1.0, 1.0))[:, None]
+    return np.stack([np.interp(log_m, log_octaves, column) for column in within.T], axis=1)
+
+
+@compiled
+def subtract_excess(
+    factors: Ints, order: Ints, first: Ints, weights: Floats, share: Floats, avar: Floats, excess: Floats
+) -> None:
+    """Subtract the contribution e V of missing samples from the mean squares of one axis.
+
+    If an Allan variance that V needs is not known, white noise is assumed at this cluster size.
+
+    Parameters
+    ----------
+    factors, order, first, weights
+        Fields of ``VarianceWithinClusters``.
+    share : ndarray of float64, shape (R,)
+        The factor e, times the cluster size.
+    avar : ndarray of float64, shape (R,)
+        On input, half the mean square of the differences; NaN if no difference counts. On output, Allan variance.
+    excess : ndarray of float64, shape (R,)
+        Output array for the subtracted contribution.
+    """
+    level = np.empty(order.size)
+    for p in range(order.size):
+        i, within = order[p], 0.0
+        for q in range(first[p], p):
+            within += weights[p, q] * level[q]
+        e = share[i] / factors[i]
+        corrected = (avar[i] - e * within) / (1.0 + e * weights[p, p]) if e != 0.0 else avar[i]
+        excess[i] = avar[i] - corrected
+        avar[i] = level[p] = corrected
+        if level[p] == level[p]:
+            continue
+        if p > first[p]:
+            level[p] = level[p - 1] * factors[order[p - 1]] / factors[i]
+            continue
+        for q in range(p + 1, order.size):
+            if first[q] == p and avar[order[q]] == avar[order[q]]:
+                level[p] = avar[order[q]] * factors[order[q]] / factors[i]
+                break
