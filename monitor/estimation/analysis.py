@@ -20,7 +20,7 @@ from monitor.estimation.allan.batch import (
     EachAxis,
     TauGrid,
     cluster_sizes,
-    overlapping_avar,
+    overlapping_allan_variances,
     rate_slope_from_thirds,
     rate_slope_per_tau,
 )
@@ -184,11 +184,12 @@ def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
     n = len(values)
-    avar, terms = overlapping_avar(values, factors, each)
+    avar, terms, excess = overlapping_allan_variances(values, factors, each)
     columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(n, factors)
     measured = MeasuredVariancesAndSlopes(
-        avar, terms, rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
-    )
+        avar, terms, rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz,
+        excess=excess,
+    )  # fmt: skip
     found = fit_coefficients(columns, covariances, measured)
     filters = [
         find_low_pass(columns, covariances, measured.select_axis(axis), power_spectrum(values[:, axis]))
@@ -197,5 +198,6 @@ def _fit_curve(
         for axis, contradicts in enumerate(axes_contradicting_five_terms(found))
     ]
     found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
-    lo, hi = deviation_intervals(avar, found.edf)
-    return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters
+    lo, hi = deviation_intervals(avar, found.edf, excess=excess)
+    curve = AllanCurve(factors / rate_hz, factors, np.maximum(avar, 0.0), terms, found.edf, lo, hi, n)
+    return curve, found, filters

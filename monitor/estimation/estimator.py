@@ -11,11 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import Floats, Ints, SampleBlock
+from drivers.data_types import Floats, SampleBlock
 from drivers.errors import NotReady
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
+from monitor.estimation.allan.missing_samples import AllanVariances
 from monitor.estimation.allan.uncertainty import (
     CovarianceTable,
     CovarianceTablesByAxis,
@@ -217,11 +218,14 @@ class Estimator:
         n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
-        avar, terms = self._window.variances_and_terms()
+        avar, terms, excess = self._window.variances()
         own, recent = slice(0, self._m), slice(self._m, None)
-        result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
-        edf = np.concatenate([result.edf, self._spans.edf(result.theta, self.rate_hz, terms[recent])])
-        lo, hi = deviation_intervals(avar, edf)
+        measured = AllanVariances(avar[own], terms[own], excess[own])
+        result = self._fit(measured) if fit_coefficients else empty_fit(avar[own])
+        recent_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent], excess[recent])
+        edf = np.concatenate([result.edf, recent_edf])
+        lo, hi = deviation_intervals(avar, edf, excess=excess)
+        avar = np.maximum(avar, 0.0)
         tau_s = self._factors / self.rate_hz
         curve, quick = (
             AllanCurve(tau_s, self._factors, avar[rows], terms[rows], edf[rows], lo[rows], hi[rows], n)
@@ -264,7 +268,7 @@ class Estimator:
             else None
         )
 
-    def _fit(self, avar: Floats, terms: Ints) -> Fit:
+    def _fit(self, variances: AllanVariances) -> Fit:
         """Fit all axes together, except for restarted axes, which have fewer samples and are fitted separately."""
         filled = self._window.samples_in_window
         np.minimum(self._lengths, filled, out=self._lengths)
@@ -279,8 +283,9 @@ class Estimator:
             table = self._tables.table_of_axis(axes[0], lengths[axes[0]], filled)
             columns = slice(None) if len(groups) == 1 else axes  # usually all axes, which need not be copied
             measured = MeasuredVariancesAndSlopes(
-                avar[:, columns], terms[:, columns], slope[columns], slopes[:, columns], before[:, columns]
-            )
+                variances.avar[:, columns], variances.terms[:, columns], slope[columns], slopes[:, columns],
+                before[:, columns], variances.excess[:, columns],
+            )  # fmt: skip
             one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, columns])
             self._theta[:, columns] = one.theta
             for column, (axis, contradicts) in enumerate(zip(axes, axes_contradicting_five_terms(one), strict=True)):

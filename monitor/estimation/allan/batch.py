@@ -29,6 +29,7 @@ from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
 from monitor.common.compiled import as_read_only, compiled
 from monitor.estimation.allan.missing_samples import (
+    MIN_PRESENT_SHARE,
     AllanVariances,
     min_present,
     subtract_excess,
@@ -41,8 +42,6 @@ TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
 EachAxis = Callable[[Callable[[Floats], AllanVariances], Iterable[Floats]], Iterable[AllanVariances]]
 """Type of the built-in function ``map`` and of the method ``map`` of a thread pool."""
 
-MIN_PRESENT_SHARE: Final = 0.98
-"""Minimum share of samples that must be present to compute a slope."""
 BLOCK: Final = 16_384
 """Number of phase points in a block. Three blocks, 0.4 MB in total, fit into a second-level cache."""
 LANES: Final = 512
@@ -125,7 +124,7 @@ def rate_slope_from_thirds(values: Floats) -> Floats:
 
     The difference between the two means is divided by two thirds of the duration T. For white noise, the variance of
     this slope is 13.5 N²/T³. A slope from linear regression would have a variance of 12 N²/T³. The rates have the shape
-    (n, k), and the slope has the shape (k,) in units per sample. The slope is NaN if more than 2 % of the samples are
+    (n, k), and the slope has the shape (k,) in units per sample. The slope is NaN if more than 30 % of the samples are
     missing.
 
     >>> rate_slope_from_thirds(0.5 * np.arange(9.0)[:, None]).tolist()
@@ -147,7 +146,8 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     """Return the slope of the rates at each averaging time, computed from the mean second difference of phase.
 
     The slope is the mean second difference of phase, divided by m². A linear drift with this slope contributes slope²
-    τ²/2 to the Allan variance. Missing samples are replaced by the mean of the axis.
+    τ²/2 to the Allan variance. If samples are missing, the slope is the mean difference between the newest and the
+    oldest m clusters, divided by their distance. A pair counts if 60 % of the samples of each cluster are present.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     Returns
     -------
     ndarray of float64, shape (m, k)
-        Slope in units per sample; NaN if more than 2 % of the samples are missing.
+        Slope in units per sample; NaN if more than 30 % of the samples are missing.
 
     >>> rate_slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
@@ -170,12 +170,32 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)
     count, mean = _mean(rates)
-    mean = np.where(count < MIN_PRESENT_SHARE * len(rates), np.nan, mean)
     first, second, third, fourth, fifth, sixth = _sums_of_phase(rates, mean, places)[at.reshape(6, -1)]
     blocks = (sixth - 2.0 * fifth + fourth) - (third - 2.0 * second + first)
     with np.errstate(invalid="ignore", divide="ignore"):
-        bent = blocks / (terms * m.astype(np.float64) ** 2)[:, None]
-        return np.where((terms > 0)[:, None] & ~np.isnan(mean), bent, np.nan)
+        slopes = np.where((terms > 0)[:, None], blocks / (terms * m.astype(np.float64) ** 2)[:, None], np.nan)
+    for axis in np.flatnonzero(count < len(rates)):
+        enough = count[axis] >= MIN_PRESENT_SHARE * len(rates)
+        slopes[:, axis] = _slopes_with_missing(rates[:, axis] - mean[axis], m) if enough else np.nan
+    return slopes
+
+
+def _slopes_with_missing(rate: Floats, factors: Ints) -> Floats:
+    present = np.isfinite(rate)
+    n, count = len(rate), np.concatenate([[0], np.cumsum(present)])
+    phase = np.concatenate([[0.0], np.cumsum(np.where(present, rate, 0.0))])
+    slopes = np.full(factors.size, np.nan)
+    for i, m in enumerate(factors.tolist()):
+        if 2 * m > n:
+            continue
+        old, new = m - 1 - np.arange(m), n - m - np.arange(m)  # begins of the clusters
+        held, kept = count[old + m] - count[old], count[new + m] - count[new]
+        some = 5 * np.minimum(held, kept) >= 3 * m
+        if some.any():
+            old, new, held, kept = old[some], new[some], held[some], kept[some]
+            rise = (phase[new + m] - phase[new]) / kept - (phase[old + m] - phase[old]) / held
+            slopes[i] = rise.mean() / (n + 1.0 - 2 * m)
+    return slopes
 
 
 @compiled

@@ -105,12 +105,12 @@ def compute_dynamic_allan(
     for row, end in enumerate(ends.tolist()):
         window.append_samples(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.drift_slopes_by_axis_and_tau()
-        measured = MeasuredVariancesAndSlopes(avar, window.term_counts(), slope * rate_hz, slopes * rate_hz, entered)
+        (avar, terms, excess), (slope, slopes) = window.variances(), window.drift_slopes_by_axis_and_tau()
+        measured = MeasuredVariancesAndSlopes(avar, terms, slope * rate_hz, slopes * rate_hz, entered, excess)
         found = fit_coefficients(columns, covariances, measured)
         entered = found.entered
-        deviation[row] = np.sqrt(avar)
-        lo[row], hi[row] = deviation_intervals(avar, found.edf)
+        deviation[row] = np.sqrt(np.maximum(avar, 0.0))
+        lo[row], hi[row] = deviation_intervals(avar, found.edf, excess=excess)
         known = found.coefficients
         value[row], value_lo[row], value_hi[row], status[row] = known.value, known.lo, known.hi, known.status
         if progress is not None:

@@ -1,9 +1,9 @@
 """Allan variance of records with missing samples: which differences count, and correction of the bias.
 
-Let two adjacent clusters of m samples contain n_A and n_B samples that are present. The difference of their means counts
-if both clusters contain at least ``MIN_PRESENT_SHARE`` of their samples. The mean of the present samples differs from
-the mean of the cluster like the mean of a sample that is drawn without replacement (Cochran, Sampling Techniques,
-theorem 2.2). Half the mean square of the counted differences is therefore too large by e V(m), where
+Let two adjacent clusters of m samples contain n_A and n_B samples that are present. The difference of their means
+counts if 60 % of the samples of each cluster are present. The mean of the present samples differs from the mean of the
+cluster like the mean of a random sample that is drawn without replacement (Cochran, Sampling Techniques, chapter 2).
+Half the mean square of the counted differences is therefore too large by e V(m), where
 
     e = mean of ½ (1/n_A + 1/n_B) − 1/m,    V(m) = mean variance of the samples within a cluster (divisor m − 1).
 
@@ -14,6 +14,7 @@ V is the sum of the Allan variances of all shorter clusters of 1, 2, 4, … samp
 The page ``docs/explanation/missing-samples.md`` derives both formulas and says where they cease to hold.
 """
 
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,11 +22,8 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined
 
-MIN_PRESENT_SHARE: Final = 0.6
-"""Minimum share of the samples of each cluster that must be present. ``min_present`` computes with exact integers.
-
-If 20 % of the samples are missing at random, nearly all clusters of 8 and more samples reach this share.
-"""
+MIN_PRESENT_SHARE: Final = 0.7
+"""Minimum share of samples that must be present to compute a slope of the rate."""
 
 
 class AllanVariances(NamedTuple):
@@ -51,7 +49,10 @@ class VarianceWithinClusters(NamedTuple):
 
 @inlined
 def min_present(m: int) -> int:
-    """Return the minimum number of present samples in a cluster of m samples, which is ⌈0.6 m⌉."""
+    """Return the minimum number of present samples in a cluster of m samples, which is ⌈0.6 m⌉.
+
+    If 20 % of the samples are missing at random, nearly all clusters of 8 and more samples contain enough samples.
+    """
     return (3 * m + 4) // 5
 
 
@@ -79,7 +80,7 @@ def variance_within_clusters(factors: Ints, spans: Ints) -> VarianceWithinCluste
     """
     edges = [0, *(np.flatnonzero(np.diff(factors) <= 0) + 1).tolist(), factors.size]
     order, first, parts = [], [], []
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges):
         own, rows = factors[begin:end], np.arange(begin, end)
         if own[0] > 1 or (own[1:] > 2 * own[:-1]).any():
             octaves = np.setdiff1d(2 ** np.arange(int(own[-1] - 1).bit_length(), dtype=np.int64), own)
@@ -133,7 +134,7 @@ def subtract_excess(
             within += weights[p, q] * level[q]
         e = share[i] / factors[i]
         corrected = (avar[i] - e * within) / (1.0 + e * weights[p, p]) if e != 0.0 else avar[i]
-        excess[i] = avar[i] - corrected
+        excess[i] = avar[i] - corrected if avar[i] == avar[i] else 0.0
         avar[i] = level[p] = corrected
         if level[p] == level[p]:
             continue

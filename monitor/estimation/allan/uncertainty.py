@@ -202,7 +202,7 @@ class DegreesOfFreedomWithSpanPerTau:
         self._columns = columns
         self._terms = np.array([one.terms[0] for one in tables])
 
-    def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
+    def edf(self, theta: Floats, rate_hz: float, terms: Ints, excess: Floats) -> Floats:
         """Return the degrees of freedom [m, k] of the Allan variances of k axes.
 
         White noise is assumed for axes without fitted coefficients.
@@ -215,48 +215,67 @@ class DegreesOfFreedomWithSpanPerTau:
             Sample rate in Hz.
         terms : ndarray of int64, shape (m, k)
             Number of averaged second differences.
+        excess : ndarray of float64, shape (m, k)
+            Contribution of missing samples that has been subtracted from the mean square.
         """
         edf = np.empty(terms.shape)
         # the kernel is compiled only for contiguous arrays
-        theta, terms = np.ascontiguousarray(theta), np.ascontiguousarray(terms)
-        _fill_edf(theta, rate_hz, self._columns, self._covariance, self._terms, terms, edf)
+        theta, terms, excess = (np.ascontiguousarray(part) for part in (theta, terms, excess))
+        _fill_edf(theta, rate_hz, self._columns, self._covariance, self._terms, terms, excess, edf)
         return edf
 
 
 @compiled
 def _fill_edf(
-    theta: Floats, rate_hz: float, columns: Floats, covariance: Floats, whole: Ints, terms: Ints, edf: Floats
+    theta: Floats,
+    rate_hz: float,
+    columns: Floats,
+    covariance: Floats,
+    whole: Ints,
+    terms: Ints,
+    excess: Floats,
+    edf: Floats,
 ) -> None:
-    shape = np.empty(NOISES)
+    shape, noise = np.empty(NOISES), np.empty(NOISES)
     for axis in range(theta.shape[1]):
         total = 0.0
         for a in range(NOISES):
             shape[a] = max(theta[a, axis], 0.0) * rate_hz ** (2.0 - a)
             total += shape[a] if theta[a, axis] == theta[a, axis] else np.nan
-        if not total > 0.0:
+        fitted = total > 0.0
+        if not fitted:
             shape[:] = 0.0
             shape[N] = 1.0
         for i in range(whole.size):
             level, variance, pair = 0.0, 0.0, 0
+            noise[:] = shape
+            if fitted:  # missing samples act like white noise
+                noise[N] += max(excess[i, axis], 0.0) / columns[i, N]
             for a in range(NOISES):
-                level += columns[i, a] * shape[a]
+                level += columns[i, a] * noise[a]
                 for b in range(a, NOISES):  # in the order of ``PAIRS``
-                    variance += covariance[i, pair] * shape[a] * shape[b] * (1.0 if a == b else 2.0)
+                    variance += covariance[i, pair] * noise[a] * noise[b] * (1.0 if a == b else 2.0)
                     pair += 1
             edf[i, axis] = 2.0 * level * level / variance * terms[i, axis] / whole[i] if terms[i, axis] > 0 else np.nan
 
 
-def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
+def deviation_intervals(
+    avar: Floats, edf: Floats, probability: float = 0.95, excess: Floats | float = 0.0
+) -> tuple[Floats, Floats]:
     """Return the ends of the two-sided χ² confidence interval of the Allan deviation (NIST SP 1065 eq. 45).
+
+    The mean square, which is the sum of ``avar`` and ``excess``, has a χ² distribution.
 
     Parameters
     ----------
     avar : ndarray of float64
         Allan variance. For NaN, the result is NaN.
     edf : ndarray of float64
-        Degrees of freedom, in the shape of ``avar``.
+        Degrees of freedom of the mean square, in the shape of ``avar``.
     probability : float
         Probability that the interval contains the true value.
+    excess : ndarray of float64, or float
+        Contribution of missing samples that has been subtracted from the mean square.
 
     Returns
     -------
@@ -269,20 +288,23 @@ def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) ->
     """
     tail = (1.0 - probability) / 2.0
     # the kernel is compiled only for contiguous arrays that can be written
-    inputs = np.array((avar, edf), np.float64)
-    ends = np.empty_like(inputs)
+    inputs = np.array((avar, edf, np.broadcast_to(excess, avar.shape)), np.float64)
+    ends = np.empty_like(inputs[:2])
     levels = expand_chi2_quantile(tail), expand_chi2_quantile(1.0 - tail)
-    _fill_intervals(inputs.reshape(2, -1), *levels, ends.reshape(2, -1))
+    _fill_intervals(inputs.reshape(3, -1), *levels, ends.reshape(2, -1))
     return ends[0], ends[1]
 
 
 @compiled
-def _fill_intervals(avar_and_edf: Floats, low: Chi2Level, high: Chi2Level, ends: Floats) -> None:
+def _fill_intervals(inputs: Floats, low: Chi2Level, high: Chi2Level, ends: Floats) -> None:
     for i in range(ends.shape[1]):
-        avar, edf = avar_and_edf[0, i], avar_and_edf[1, i]
+        edf, excess = inputs[1, i], inputs[2, i]
+        raw = inputs[0, i] + excess
         lower, upper = chi2_quantile(edf, low), chi2_quantile(edf, high)
-        ends[0, i], ends[1, i] = np.sqrt(avar * edf / upper), np.sqrt(avar * edf / lower)
-        if lower == 0.0 and avar >= 0.0:  # with less than one degree of freedom, the upper end may be infinite
+        ends[0, i], ends[1, i] = raw * edf / upper - excess, raw * edf / lower - excess
+        for end in range(2):
+            ends[end, i] = np.sqrt(ends[end, i] if excess == 0.0 else max(ends[end, i], 0.0))
+        if lower == 0.0 and raw >= 0.0:  # with less than one degree of freedom, the upper end may be infinite
             ends[1, i] = np.inf
 
 

@@ -3,7 +3,8 @@
 For every axis and cluster size m, the window stores the sum S and the number C of the squared second differences of
 phase. The Allan variance of the rate is S / (2 m² C) ("Dynamic extraction of random drift error coefficients of MEMS
 gyroscopes", equations 12 to 15). A new sample adds one second difference and removes the oldest one, so the cost does
-not depend on the window length. NaN in the input means a missing sample.
+not depend on the window length. NaN in the input means a missing sample. If samples of a cluster are missing, the mean
+of the other samples is used, and the bias is corrected (``missing_samples``).
 
 Three measures keep the sums of squares exact.
 
@@ -12,8 +13,8 @@ Three measures keep the sums of squares exact.
   so that full-scale input cannot cause an overflow at the longest τ.
 - A second difference of integer phase has exactly the same square when it is removed as when it was added. The rounding
   errors of the sums are accumulated in a second double-precision number (Knuth's TwoSum).
-- A running count of missing samples shows whether a second difference is complete. Incomplete second differences are
-  neither added nor removed.
+- A running count of missing samples gives the number of samples in each cluster. The contribution of missing samples is
+  summed as an integer.
 
 Rounding adds white phase noise of variance 2^-2s/12. For a window of one hour at 100 Hz and noise of 1e-4 rad/s or m/s²
 per sample, the relative change of the Allan variance is 1e-10.
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
+from monitor.estimation.allan.missing_samples import AllanVariances, variance_within_clusters
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
@@ -137,15 +139,18 @@ class AllanWindow:
         self.length = length
         self.factors = factors.astype(np.int64)
         self.spans = spans.astype(np.int64)
-        self._taus = int(factors.size)
+        # the last rows are powers of two that the correction for missing samples needs
+        within = variance_within_clusters(self.factors, self.spans)
+        self._taus = int(within.factors.size)
         self._scale = integer_phase_scale(int(factors.max()))
         taus = self._taus
         self._memory = _aligned(window_memory_size(length, taus))
         arrays = view_window_arrays(self._memory, taus)
         self._state, self._phase, self._scaling = arrays.state, arrays.phase, arrays.scaling
         self._missing = arrays.missing
-        arrays.factors[:], arrays.spans[:] = self.factors, self.spans
-        self._terms = arrays.terms.reshape(taus, LANES)
+        arrays.factors[:], arrays.spans[:] = within.factors, within.spans
+        arrays.order[:], arrays.first[:], arrays.weights[:] = within.order, within.first, within.weights.ravel()
+        self._terms, self._excess = arrays.terms.reshape(taus, LANES), arrays.excess
         self._sums, self._rest = arrays.sums.reshape(taus, LANES), arrays.rest.reshape(taus, LANES)
         self._stage = arrays.stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
         self._first_staged = self._stage[:1]  # creating this view takes 0.1 µs
@@ -174,7 +179,7 @@ class AllanWindow:
     def discard_samples(self) -> None:
         """Discard all samples in the window."""
         self.resets += 1
-        self._terms[:] = 0
+        self._terms[:], self._excess[:] = 0, 0
         self._sums[:] = self._rest[:] = 0.0
         self._scaling[:LANES], self._scaling[LANES:] = self._scale, 0.0
         self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
@@ -226,7 +231,7 @@ class AllanWindow:
             self.append_samples(hole[: n - start])
 
     def keep_newest(self, axis: int, n: int) -> None:
-        """Mark all but the newest n samples of one axis as missing.
+        """Discard all but the newest n samples of one axis. No cluster that contains a discarded sample counts.
 
         Parameters
         ----------
@@ -240,13 +245,15 @@ class AllanWindow:
 
     def avar(self) -> Floats:
         """Return the Allan variance [m, 6] in squared units of the axis; NaN if too many samples are missing."""
-        return self.variances_and_terms()[0]
+        return np.maximum(self.variances().avar, 0.0)
 
-    def variances_and_terms(self) -> tuple[Floats, Ints]:
-        """Return the Allan variance [m, 6], and the number of second differences [m, 6] that it averages."""
-        avar, terms = np.empty((self._taus, AXES)), np.empty((self._taus, AXES), np.int64)
-        copy_variances(self._memory, self._taus, avar, terms)
-        return avar, terms
+    def variances(self) -> AllanVariances:
+        """Return the Allan variances of six axes, corrected for missing samples."""
+        shape = (self._taus, AXES)
+        avar, terms, excess = np.empty(shape), np.empty(shape, np.int64), np.empty(shape)
+        copy_variances(self._memory, self._taus, avar, terms, excess)
+        shown = slice(self.factors.size)
+        return AllanVariances(avar[shown], terms[shown], excess[shown])
 
     def drift_slopes_by_axis_and_tau(
         self, lengths: Ints | None = None, taus: int | None = None
@@ -269,14 +276,14 @@ class AllanWindow:
         slopes : ndarray of float64, shape (m, 6)
             Slope at each τ in units of the axis per sample.
         """
-        slope, slopes = np.empty(AXES), np.empty((AXES, taus or self._taus))
+        slope, slopes = np.empty(AXES), np.empty((AXES, taus or self.factors.size))
         lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
         drift_slopes_by_axis_and_tau(self._memory, self._taus, lengths, slope, slopes)
         return slope, slopes.T
 
     def term_counts(self) -> Ints:
         """Return the number of second differences [m, 6] that each Allan variance averages."""
-        return self._terms[:, :AXES].copy()
+        return self._terms[: self.factors.size, :AXES].copy()
 
     def newest_samples(self, axis: int, n: int) -> Floats:
         """Return up to n newest samples of one axis, reconstructed from the phase; NaN means missing.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined, without_reference_count
+from monitor.estimation.allan.missing_samples import MIN_PRESENT_SHARE, min_present, subtract_excess
 
 AXES: Final = 6
 LANES: Final = 8
@@ -28,8 +29,12 @@ STAGE_SAMPLES: Final = 512
 """Maximum number of samples that are passed to the compiled code at a time."""
 LINE: Final = 8
 """Number of 8-byte numbers in a cache line."""
-MIN_PRESENT_SHARE: Final = 0.98
-"""Minimum share of samples that must be present to compute a slope."""
+EXCESS_UNIT: Final = 2.0**-38
+"""Unit of ``WindowArrays.excess``. The sum of 10⁷ terms stays below 2⁶³."""
+MAX_ROUNDING_SQUARE: Final = 12.0
+"""Largest square, in squared units of phase, that rounding causes if 40 % of a cluster are missing."""
+DISCARDED: Final = 1 << 30
+"""Step of the count of missing samples before the oldest sample that an axis keeps."""
 LEVEL: Final = 64
 """Number of newest samples whose mean is the reference level of an axis."""
 NEVER: Final = 1 << 62
@@ -58,19 +63,23 @@ class WindowArrays(NamedTuple):
     factors: Ints  # [m] cluster sizes in samples
     spans: Ints  # [m] number of newest samples that are used at each cluster size
     terms: Ints  # [m · LANES] number of second differences in each sum
+    excess: Ints  # [m · LANES] sums of m/n_A + m/n_B − 2 in ``EXCESS_UNIT``, where n samples of a cluster are present
+    order: Ints  # [m] field of ``VarianceWithinClusters``
+    first: Ints  # [m] field of ``VarianceWithinClusters``
     phase: Ints  # [places · LANES] ring buffer of integer phase
     scaling: Floats  # [2 · LANES] scale factors to integer phase, and rounding errors to add to the next sample
     scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares to add to the sums, and squares to subtract
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
-    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples, modulo 2³²
+    weights: Floats  # [m · m] field of ``VarianceWithinClusters``
+    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
 
 
 def window_memory_size(length: int, taus: int) -> int:
     """Return the number of 8-byte numbers that a window of ``length`` samples with ``taus`` cluster sizes needs."""
-    header = LANES + (2 * taus + LINE - 1) // LINE * LINE
-    samples = 2 + 2 * RUN_SAMPLES + 3 * taus + STAGE_SAMPLES
+    header = LANES + (4 * taus + LINE - 1) // LINE * LINE + (taus * taus + LINE - 1) // LINE * LINE
+    samples = 2 + 2 * RUN_SAMPLES + 4 * taus + STAGE_SAMPLES
     return header + samples * LANES + (length + 1 + RUN_SAMPLES) * (LANES + LANES // 2)
 
 
@@ -82,8 +91,10 @@ def view_window_arrays(memory: Ints, taus: int) -> WindowArrays:
     memory, taus
         Fields of ``WindowBuffers``.
     """
-    spans, terms = LANES + taus, LANES + (2 * taus + LINE - 1) // LINE * LINE
-    scaling = terms + taus * LANES
+    weights = LANES + (4 * taus + LINE - 1) // LINE * LINE
+    terms = weights + (taus * taus + LINE - 1) // LINE * LINE
+    excess = terms + taus * LANES
+    scaling = excess + taus * LANES
     scratch = scaling + 2 * LANES
     sums = scratch + 2 * RUN_SAMPLES * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
@@ -91,9 +102,11 @@ def view_window_arrays(memory: Ints, taus: int) -> WindowArrays:
     missing = phase + (memory.size - phase) // 3 * 2  # a count of missing samples takes half the memory of a phase
     floats = memory.view(np.float64)
     return WindowArrays(
-        memory[:LANES], memory[LANES:spans], memory[spans : spans + taus], memory[terms:scaling],
-        memory[phase:missing], floats[scaling:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage],
-        floats[stage:phase], memory[missing:].view(np.int32),
+        memory[:LANES], memory[LANES : LANES + taus], memory[LANES + taus : LANES + 2 * taus], memory[terms:excess],
+        memory[excess:scaling], memory[LANES + 2 * taus : LANES + 3 * taus],
+        memory[LANES + 3 * taus : LANES + 4 * taus], memory[phase:missing], floats[scaling:scratch],
+        floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:phase],
+        floats[weights : weights + taus * taus], memory[missing:].view(np.int32),
     )  # fmt: skip
 
 
@@ -118,8 +131,8 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
         Number of samples.
     """
     # All fields are unpacked at once, because each field access on a named tuple takes time.
-    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = compiled_view_window_arrays(
-        without_reference_count(memory), taus
+    state, factors, spans, terms, excess, _, _, phase, scaling, scratch, sums, rest, stage, _, missing = (
+        compiled_view_window_arrays(without_reference_count(memory), taus)
     )
     places = phase.size // LANES
     length = places - 1 - RUN_SAMPLES
@@ -137,7 +150,10 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
                 some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
                 _replace_terms(first, factors[some], spans[some], phase, scratch, sums[lanes], rest[lanes])
         else:
-            _add_run(first, run, count, whole, factors, spans, phase, missing, scratch, terms, sums, rest, state[WIDTH])
+            _add_run(
+                first, run, count, whole, factors, spans, phase, missing, scratch, terms, excess, sums, rest,
+                state[WIDTH],
+            )  # fmt: skip
 
 
 @compiled
@@ -152,6 +168,7 @@ def _add_run(
     missing: NDArray[np.int32],
     scratch: Floats,
     terms: Ints,
+    excess: Ints,
     sums: Floats,
     rest: Floats,
     lanes: int,
@@ -168,7 +185,7 @@ def _add_run(
             end = run if leaving else min(run, spans[i] - count)
             row += _slide(
                 now, end - row, factors[i], spans[i], leaving, whole,
-                phase, missing, scratch, terms[own], sums[own], rest[own], lanes,
+                phase, missing, scratch, terms[own], excess[own], sums[own], rest[own], lanes,
             )  # fmt: skip
 
 
@@ -214,6 +231,7 @@ def _slide(
     missing: NDArray[np.int32],
     scratch: Floats,
     terms: Ints,
+    excess: Ints,
     sums: Floats,
     rest: Floats,
     lanes: int,
@@ -235,9 +253,9 @@ def _slide(
     else:
         evicted[:n] = 0.0
     if not whole:
-        _remove_incomplete(missing, now, new2, 1, n, added, terms)
+        _replace_incomplete(phase, missing, now, new1, new2, m, run, 1, added, terms, excess)
         if leaving:
-            _remove_incomplete(missing, old0, old2, -1, n, evicted, terms)
+            _replace_incomplete(phase, missing, old0, old1, old2, m, run, -1, evicted, terms, excess)
     elif not leaving:
         terms += run
     _exchange(added, evicted, n, sums, rest, lanes)
@@ -266,16 +284,79 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
         out[i] = d * d
 
 
+@inlined
+def missing_between(missing: NDArray[np.int32], newer: int, older: int) -> int:
+    """Return the number of missing samples between two elements of the running count, which wraps around."""
+    return int(np.int32(missing[newer] - missing[older]))
+
+
 @compiled
-def _remove_incomplete(
-    missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints
+def _replace_incomplete(
+    phase: Ints,
+    missing: NDArray[np.int32],
+    at0: int,
+    at1: int,
+    at2: int,
+    m: int,
+    rows: int,
+    step: int,
+    squares: Floats,
+    terms: Ints,
+    excess: Ints,
 ) -> None:
-    """Set squares with a missing sample to zero, and add ``step`` to the count ``terms`` for each complete square."""
-    for i in range(n):
-        if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
-            terms[i % LANES] += step
-        else:
+    """Replace the squares of differences with missing samples, and add the terms ``step`` times to the counts.
+
+    The square is zero if too few samples of a cluster are present. Usually, the same samples are missing on all axes,
+    so the two divisions are repeated only if the numbers of missing samples change.
+    """
+    most, older, newer, extra, counted = m - min_present(m), 0, 0, 0, True
+    share_a = share_b = 1.0 / m
+    for i in range(rows * LANES):
+        if i % LANES >= AXES:
+            continue
+        i0, i1, i2 = at0 * LANES + i, at1 * LANES + i, at2 * LANES + i
+        a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
+        if a != older or b != newer:
+            older, newer = a, b
+            counted = a <= most and b <= most
+            if counted:
+                share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
+                extra = step * _excess_of_term(a, b, share_a, share_b)
+        if not counted:
             squares[i] = 0.0
+            continue
+        terms[i % LANES] += step
+        if a != 0 or b != 0:
+            d = difference_of_means(phase[i1] - phase[i2], phase[i0] - phase[i1], m - a, m - b, share_a, share_b) * m
+            squares[i] = d * d
+            excess[i % LANES] += extra
+
+
+@inlined
+def _excess_of_term(missing_older: int, missing_newer: int, older_share: float, newer_share: float) -> int:
+    """Return m/n_A + m/n_B − 2 in ``EXCESS_UNIT``."""
+    return int(np.int64(np.rint((missing_older * older_share + missing_newer * newer_share) / EXCESS_UNIT)))
+
+
+@inlined
+def difference_of_means(
+    older_sum: int, newer_sum: int, older: int, newer: int, older_share: float, newer_share: float
+) -> float:
+    """Return the difference between the means of the present samples in two clusters, in integer units.
+
+    The integer closest to the mean of the older cluster is subtracted from all samples, so no precision is lost.
+
+    Parameters
+    ----------
+    older_sum, newer_sum : int
+        Sums of the present samples.
+    older, newer : int
+        Numbers of present samples.
+    older_share, newer_share : float
+        Reciprocals of these numbers.
+    """
+    level = np.int64(np.rint(older_sum * older_share))
+    return float(newer_sum - level * newer) * newer_share - float(older_sum - level * older) * older_share
 
 
 @compiled
@@ -338,12 +419,10 @@ def keep_newest(memory: Ints, taus: int, axis: int, n: int) -> None:
     """
     w = compiled_view_window_arrays(memory, taus)
     state, missing, places = w.state, w.missing, w.phase.size // LANES
-    # Give older phase points different counts of missing samples, so that older second differences count as incomplete.
+    # No cluster that contains a discarded sample counts, whatever its length.
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
-        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = wrap_count(
-            np.int64(missing[oldest]) - back
-        )
+        missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - DISCARDED - back
     state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         _recompute_sum(w, i, axis, n)
@@ -352,19 +431,25 @@ def keep_newest(memory: Ints, taus: int, axis: int, n: int) -> None:
 @compiled
 def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
     phase, missing, m, own, places = w.phase, w.missing, w.factors[i], i * LANES + axis, w.phase.size // LANES
-    total, left, count = 0.0, 0.0, 0
+    most, total, left, count, excess = m - min_present(m), 0.0, 0.0, 0, 0
     for back in range(min(n, w.spans[i]) - 2 * m, -1, -1):
         at = w.state[NEWEST] - back
-        at0, at1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
-        at2 = ring_row(at - 2 * m, places) * LANES + axis
-        if missing[at0] == missing[at2]:
-            d = float(phase[at0] - 2 * phase[at1] + phase[at2])
-            s = total + d * d
-            z = s - total
-            left += (total - (s - z)) + (d * d - z)
-            total = s
-            count += 1
-    w.sums[own], w.rest[own], w.terms[own] = total, left, count
+        i0, i1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
+        i2 = ring_row(at - 2 * m, places) * LANES + axis
+        a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
+        if a > most or b > most:
+            continue
+        d = float(phase[i0] - 2 * phase[i1] + phase[i2])
+        if a != 0 or b != 0:
+            share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
+            d = difference_of_means(phase[i1] - phase[i2], phase[i0] - phase[i1], m - a, m - b, share_a, share_b) * m
+            excess += _excess_of_term(a, b, share_a, share_b)
+        s = total + d * d
+        z = s - total
+        left += (total - (s - z)) + (d * d - z)
+        total = s
+        count += 1
+    w.sums[own], w.rest[own], w.terms[own], w.excess[own] = total, left, count, excess
 
 
 @inlined
@@ -372,7 +457,7 @@ def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: in
     """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing."""
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
-    present = min(n, LEVEL) - wrap_count(np.int64(missing[last]) - missing[first])
+    present = min(n, LEVEL) - missing_between(missing, last, first)
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
@@ -404,11 +489,10 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
         return np.nan
     at0, at1 = newest * LANES + axis, ring_row(newest - third, places) * LANES + axis
     at2, at3 = ring_row(newest - 2 * third, places) * LANES + axis, ring_row(newest - 3 * third, places) * LANES + axis
-    late = third - wrap_count(np.int64(missing[at0]) - missing[at1])
-    early = third - wrap_count(np.int64(missing[at2]) - missing[at3])
+    late, early = third - missing_between(missing, at0, at1), third - missing_between(missing, at2, at3)
     if (
         min(late, early) < MIN_PRESENT_SHARE * third
-        or 3 * third - wrap_count(np.int64(missing[at0]) - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
+        or 3 * third - missing_between(missing, at0, at3) < MIN_PRESENT_SHARE * 3 * third
     ):
         return np.nan
     # Phase wraps modulo 2⁶⁴, so the small difference is computed before the conversion to floating point.
@@ -417,8 +501,33 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
     return float(rise / (2.0 * third))
 
 
+@inlined
+def half_mean_square(total: float, count: int, excess: int, unit: float) -> float:
+    """Return half the mean square of the differences between cluster means in squared units of the axis.
+
+    Parameters
+    ----------
+    total : float
+        Sum of the squared second differences of phase.
+    count : int
+        Number of second differences.
+    excess : int
+        Element of ``WindowArrays.excess``.
+    unit : float
+        Value 2 m² in squared integer units.
+
+    Returns
+    -------
+    float
+        Half the mean square; 0 if it may be caused by rounding alone, as on a constant axis; NaN without differences.
+    """
+    if count == 0:
+        return np.nan
+    return total / (unit * count) if total > (MAX_ROUNDING_SQUARE if excess != 0 else 1.0) * count else 0.0
+
+
 @compiled
-def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints) -> None:
+def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints, excess: Floats) -> None:
     """Compute the Allan variance of each axis at each averaging time.
 
     Parameters
@@ -429,16 +538,48 @@ def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints) -> None:
         Output array for the Allan variances in squared units of the axis; NaN if too many samples are missing.
     terms : ndarray of int64, shape (m, 6)
         Output array for the number of second differences that each Allan variance averages.
+    excess : ndarray of float64, shape (m, 6)
+        Output array for the contributions of missing samples, which have been subtracted.
     """
     w = compiled_view_window_arrays(memory, taus)
-    for i in range(taus):
-        for axis in range(AXES):
-            at = i * LANES + axis
-            total, count, unit = w.sums[at] + w.rest[at], w.terms[at], w.factors[i] * w.scaling[axis]
-            # Even on a constant axis, rounding causes second differences of up to one unit.
-            total = 0.0 if total <= count else total
-            avar[i, axis] = total / (2.0 * unit * unit * count) if count > 0 else np.nan
-            terms[i, axis] = count
+    level, subtracted, share = np.empty((3, taus))
+    for axis in range(AXES):
+        compute_variances_of_axis(w, axis, taus, level, subtracted, share)
+        for i in range(taus):
+            avar[i, axis], terms[i, axis], excess[i, axis] = level[i], w.terms[i * LANES + axis], subtracted[i]
+
+
+@compiled
+def compute_variances_of_axis(
+    w: WindowArrays, axis: int, rows: int, avar: Floats, excess: Floats, share: Floats
+) -> None:
+    """Compute the Allan variances of one axis for the first ``rows`` elements of ``w.order``.
+
+    Parameters
+    ----------
+    w : WindowArrays
+        Data of the window with m cluster sizes.
+    axis : int
+        Index of the axis.
+    rows : int
+        Number of cluster sizes; a multiple of whole grids.
+    avar : ndarray of float64, shape (m,)
+        Output array for the Allan variances in squared units of the axis.
+    excess : ndarray of float64, shape (m,)
+        Output array for the contributions of missing samples, which have been subtracted.
+    share : ndarray of float64, shape (m,)
+        Memory for intermediate results.
+    """
+    complete = True
+    for p in range(rows):
+        i = w.order[p]
+        at, unit = i * LANES + axis, w.factors[i] * w.scaling[axis]
+        avar[i] = half_mean_square(w.sums[at] + w.rest[at], w.terms[at], w.excess[at], 2.0 * unit * unit)
+        excess[i], share[i] = 0.0, 0.5 * EXCESS_UNIT * w.excess[at] / max(w.terms[at], 1)
+        complete = complete and w.excess[at] == 0
+    if not complete:
+        taus = w.factors.size
+        subtract_excess(w.factors, w.order[:rows], w.first[:rows], w.weights.reshape(taus, taus), share, avar, excess)
 
 
 @compiled
@@ -471,25 +612,32 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
     In the sum of all second differences, only four blocks of m phase points near the ends do not cancel. About
-    ``BEND_POINTS`` phase points represent each block. A missing sample is replaced by the mean of the newest samples.
-    The result is in integer units per sample, or NaN if too many samples are missing. The other parameters are those of
-    ``integer_slope_from_thirds``.
+    ``BEND_POINTS`` phase points represent each block. If samples are missing, the result is the mean difference between
+    the newest and the oldest clusters, divided by their distance. The result is in integer units per sample, or NaN if
+    too many samples are missing. The other parameters are those of ``integer_slope_from_thirds``.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - n, places) * LANES + axis
-    middle = _reference_level(phase, missing, newest, n, axis)
-    if n < 2 * m or middle == NEVER or n - wrap_count(np.int64(missing[last]) - missing[first]) < MIN_PRESENT_SHARE * n:
+    if n < 2 * m or n - missing_between(missing, last, first) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride, has_gaps = max(1, m // BEND_POINTS), missing[last] != missing[first]
-    total = 0.0
+    most, total, points = m - min_present(m), 0.0, 0
     for k in range(0, m, stride):
         at0, at1 = ring_row(newest - k, places) * LANES + axis, ring_row(newest - m - k, places) * LANES + axis
         at2 = ring_row(newest - n + 2 * m - 1 - k, places) * LANES + axis
         at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
-        change = phase[at0] - phase[at1] - phase[at2] + phase[at3]
         if has_gaps:
-            change += middle * wrap_count(np.int64(missing[at0]) - missing[at1] - missing[at2] + missing[at3])
-        total += float(change)
-    points = (m + stride - 1) // stride
+            a, b = missing_between(missing, at2, at3), missing_between(missing, at0, at1)
+            if a > most or b > most:
+                continue
+            change = m * difference_of_means(
+                phase[at2] - phase[at3], phase[at0] - phase[at1], m - a, m - b, 1.0 / (m - a), 1.0 / (m - b)
+            )
+        else:
+            change = float(phase[at0] - phase[at1] - phase[at2] + phase[at3])
+        total += change
+        points += 1
+    if points == 0:
+        return np.nan
     # The number of second differences is n + 1 − 2m.
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

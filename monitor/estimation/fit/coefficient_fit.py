@@ -156,6 +156,7 @@ class MeasuredVariancesAndSlopes:
     slope: Floats | None = None  # [k] ``batch.rate_slope_from_thirds`` in unit/s; None or NaN if unknown
     slopes: Floats | None = None  # [m, k] ``batch.rate_slope_per_tau`` in unit/s; if None, a strong drift biases K
     entered_before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
+    excess: Floats | None = None  # [m, k] field of ``AllanVariances``; None if no samples are missing
 
     def select_axis(self, column: int) -> "MeasuredVariancesAndSlopes":
         """Return the measured Allan variances and slopes of one axis."""
@@ -163,7 +164,8 @@ class MeasuredVariancesAndSlopes:
         slope = None if self.slope is None else self.slope[one]
         slopes = None if self.slopes is None else self.slopes[:, one]
         before = None if self.entered_before is None else self.entered_before[:, one]
-        return MeasuredVariancesAndSlopes(self.avar[:, one], self.terms[:, one], slope, slopes, before)
+        excess = None if self.excess is None else self.excess[:, one]
+        return MeasuredVariancesAndSlopes(self.avar[:, one], self.terms[:, one], slope, slopes, before, excess)
 
 
 def fit_coefficients(
@@ -205,6 +207,7 @@ def fit_coefficients(
     if start_theta is not None:
         found.theta[:] = start_theta.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
+    excess = np.zeros((axes, m)) if measured.excess is None else np.ascontiguousarray(measured.excess.T)
     slope = np.full(axes, np.nan) if measured.slope is None else measured.slope / design.rate_hz
     slopes = np.tile(slope, (m, 1)).T if measured.slopes is None else measured.slopes.T / design.rate_hz
     options = FitOptions(
@@ -215,7 +218,7 @@ def fit_coefficients(
         0,
         axes,
         shared,
-        VariancesAndSlopesOfAxes(curves, counts, slope, np.ascontiguousarray(slopes)),
+        VariancesAndSlopesOfAxes(curves, counts, slope, np.array(slopes, order="C"), excess),
         options,
         found,
         NO_MAPS,

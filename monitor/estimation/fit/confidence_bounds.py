@@ -71,7 +71,7 @@ def confidence_interval_end(estimate: float, c0: float, c1: float, c2: float, z:
 
 @compiled
 def limit_terms_by_measured_avar(
-    avar: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
+    avar: Floats, excess: Floats, edf: Floats, rows: Ints, unit_avar: Floats, filter_memory: int, terms: TermResults
 ) -> None:
     """Limit each coefficient so that no noise term alone exceeds a measured Allan variance.
 
@@ -80,8 +80,8 @@ def limit_terms_by_measured_avar(
 
     Parameters
     ----------
-    avar, edf : ndarray of float64, shape (m,)
-        Allan variances and their degrees of freedom.
+    avar, excess, edf : ndarray of float64, shape (m,)
+        Allan variances, contributions of missing samples that have been subtracted, and degrees of freedom.
     rows : ndarray of int64
         Indices of the τ to use.
     unit_avar : ndarray of float64, shape (m, 5)
@@ -95,7 +95,7 @@ def limit_terms_by_measured_avar(
         most = np.inf
         for i in rows:
             if unit_avar[i, a] > 0.0 and (a != N or unit_avar[i, N] * filter_memory < 1.0):
-                most = min(most, avar_upper_limit(avar[i], edf[i], EXCLUSION_SIGMA) / unit_avar[i, a])
+                most = min(most, avar_upper_limit(avar[i], excess[i], edf[i], EXCLUSION_SIGMA) / unit_avar[i, a])
         most = np.sqrt(most)
         if terms.status[a] == 0 or terms.hi[a] <= most:
             continue
@@ -105,15 +105,15 @@ def limit_terms_by_measured_avar(
 
 
 @compiled
-def avar_upper_limit(avar: float, edf: float, z: float) -> float:
+def avar_upper_limit(avar: float, excess: float, edf: float, z: float) -> float:
     """Return the upper confidence limit of the true Allan variance at z σ (Wilson & Hilferty 1931).
 
     With too few degrees of freedom, the limit is infinite.
 
     Parameters
     ----------
-    avar : float
-        Measured Allan variance.
+    avar, excess : float
+        Measured Allan variance, and the contribution of missing samples that has been subtracted from it.
     edf : float
         Degrees of freedom of the Allan variance.
     z : float
@@ -121,21 +121,21 @@ def avar_upper_limit(avar: float, edf: float, z: float) -> float:
     """
     spread = 2.0 / (9.0 * max(edf, 1.0))
     shrunk = 1.0 - spread - z * np.sqrt(spread)
-    return float(avar / shrunk**3 if shrunk > MIN_CUBE_ROOT_FACTOR else np.inf)
+    return float(max((avar + excess) / shrunk**3 - excess, 0.0) if shrunk > MIN_CUBE_ROOT_FACTOR else np.inf)
 
 
 @compiled
-def bound_q_by_first_point(avar: float, edf: float, unit_avar: float, terms: TermResults) -> None:
+def bound_q_by_first_point(avar: float, excess: float, edf: float, unit_avar: float, terms: TermResults) -> None:
     """Compute an upper bound of Q from the Allan variance at the shortest τ.
 
     Parameters
     ----------
-    avar, edf : float
-        Allan variance at the shortest τ, and its degrees of freedom.
+    avar, excess, edf : float
+        Allan variance at the shortest τ, contribution of missing samples, and degrees of freedom.
     unit_avar : float
         Allan variance of unit Q at the shortest τ.
     terms : TermResults
         Results of the fit, updated in place.
     """
     terms.entered[Q], terms.status[Q] = False, 1
-    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(avar_upper_limit(avar, edf, UPPER_BOUND_Z) / unit_avar)
+    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(avar_upper_limit(avar, excess, edf, UPPER_BOUND_Z) / unit_avar)

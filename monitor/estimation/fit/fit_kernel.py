@@ -105,8 +105,8 @@ def _fit_axis(
     straight = slope == slope
     terms = TermResults(output.entered[axis], output.theta[axis], output.lo[axis], output.hi[axis], output.status[axis])
     problem = LeastSquares(
-        np.empty(m), np.empty(m), shared.flat if straight else shared.columns, shared.covariance,
-        shared.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
+        np.empty(m), curves.excess[axis], np.zeros(m), np.empty(m), shared.flat if straight else shared.columns,
+        shared.covariance, shared.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     rows = _prepare_rows(axis, shared, curves, problem)
     stores_map = maps.used.shape[0] > 0
@@ -125,18 +125,23 @@ def _fit_axis(
     for a in range(5):
         if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # too few averaging times for an upper bound
             terms.status[a], terms.lo[a], terms.hi[a] = 0, np.nan, np.nan
-    noise, most, output.either[axis] = update_ramp_selection(slope, shared.slope_variance, options, terms)
+    extra = problem.extra_white[rows[-1]]
+    noise, most, output.either[axis] = update_ramp_selection(
+        slope, extra * extra, shared.slope_variance, options, terms
+    )
     compute_observation_variances(problem, rows, terms.theta)
-    _draw(axis, rows, shared.columns, noise, problem.variance, output)
+    _draw(axis, rows, shared.columns, noise, problem, output)
     if stores_map:
         maps.free[axis] = free
         if store_linear_map(axis, used, problem, curves, output, maps):
             compute_linear_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
-        limit_terms_by_measured_avar(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
+        limit_terms_by_measured_avar(
+            curve, problem.excess, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms
+        )
     if free:
         i = rows[0]
-        bound_q_by_first_point(curve[i], output.edf[axis, i], shared.columns[i, Q], terms)
+        bound_q_by_first_point(curve[i], problem.excess[i], output.edf[axis, i], shared.columns[i, Q], terms)
 
 
 @compiled
@@ -158,9 +163,14 @@ def _prepare_rows(axis: int, shared: SharedInputs, curves: VariancesAndSlopesOfA
     curve, terms, slope = curves.avar[axis], curves.terms[axis], curves.slope[axis]
     rows, count = np.empty(curve.size, np.int64), 0
     for i in range(curve.size):
-        if curve[i] > 0.0 and terms[i] > 0.0 and shared.whole[i] > 0.0:
+        excess = problem.excess[i]
+        if curve[i] + excess > 0.0 and terms[i] > 0.0 and shared.whole[i] > 0.0:
             rows[count] = i
             problem.stretch[i] = np.sqrt(shared.whole[i] / terms[i])
+            # the Allan variance of white noise N² is N²/m, and that of a ramp R² is R² m²/2
+            problem.extra_white[i] = np.sqrt(max(excess, 0.0) * np.sqrt(2.0 * shared.columns[i, R]))
+            if curves.slopes[axis, i] != curves.slopes[axis, i]:
+                curves.slopes[axis, i] = slope
             line = slope * (2.0 * curves.slopes[axis, i] - slope) if slope == slope else 0.0
             problem.level[i] = curve[i] - line * shared.columns[i, R]
             count += 1
@@ -194,8 +204,8 @@ def _fit_or_fall_back(
 
 
 @compiled
-def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats, output: FitOutput) -> None:
-    theta = output.theta[axis]
+def _draw(axis: int, rows: Ints, columns: Floats, noise: float, problem: LeastSquares, output: FitOutput) -> None:
+    theta, variance = output.theta[axis], problem.variance
     for k in range(rows.size):
         i = rows[k]
         model, positive = 0.0, 0.0
@@ -205,7 +215,7 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
         output.fitted[axis, i] = model if k >= output.left_out[axis] and model > 0.0 else np.nan
         # The cross term of drift and noise in the squared second differences adds the variance 4 R² (m²/2)² Var(slope).
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
-        edf = 2.0 * positive * positive / variance[i]
+        edf = 2.0 * (positive + problem.excess[i]) ** 2 / variance[i]
         if edf == edf:
             output.edf[axis, i] = edf
 
@@ -232,7 +242,8 @@ def _fit_terms(
             compute_weights(problem, used, theta, full_covariance)
         else:
             for i in used:  # the weights of the first iteration assume white noise
-                variance = curve[i] * curve[i] * problem.covariance[i, i, WHITE] / problem.columns[i, N] ** 2
+                raw = curve[i] + problem.excess[i]
+                variance = raw * raw * problem.covariance[i, i, WHITE] / problem.columns[i, N] ** 2
                 for a in range(5):
                     problem.weighted[i, a] = problem.columns[i, a] / variance
         for _ in range(WARM_PASSES if warm else COLD_PASSES):
@@ -259,7 +270,7 @@ def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, fl
 
     If the mean squared residual exceeds the limit, the confidence intervals are widened (Birge 1932).
     """
-    level, columns, variance = problem.level, problem.columns, problem.variance
+    level, columns, variance, excess = problem.level, problem.columns, problem.variance, problem.excess
     total, freedom = 0.0, rows.size
     for a in range(NOISES):
         if theta[a] != 0.0:
@@ -268,9 +279,10 @@ def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, fl
         model = 0.0
         for a in range(5):
             model += columns[i, a] * theta[a]
+        raw = model + excess[i]
         if model > 0.0:
-            spread = variance[i] / (9.0 * model * model)
-            total += ((max(level[i], 0.0) / model) ** (1.0 / 3.0) - 1.0 + spread) ** 2 / spread
+            spread = variance[i] / (9.0 * raw * raw)
+            total += ((max(level[i] + excess[i], 0.0) / raw) ** (1.0 / 3.0) - 1.0 + spread) ** 2 / spread
     freedom = max(freedom, 1)
     return total / freedom, 1.0 + TOTAL_MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
@@ -289,7 +301,9 @@ def _is_contradicted(problem: LeastSquares, rows: Ints, theta: Floats, limit: fl
             model += columns[i, a] * theta[a]
         if model <= 0.0:
             return True
-        spread = problem.variance[i] / (9.0 * model * model)  # 2/(9 edf)
-        if abs((problem.level[i] / model) ** (1.0 / 3.0) - 1.0 + spread) > limit * np.sqrt(spread):
+        excess = problem.excess[i]
+        spread = problem.variance[i] / (9.0 * (model + excess) ** 2)  # 2/(9 edf)
+        ratio = (problem.level[i] + excess) / (model + excess)
+        if abs(ratio ** (1.0 / 3.0) - 1.0 + spread) > limit * np.sqrt(spread):
             return True
     return False

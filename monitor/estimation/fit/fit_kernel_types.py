@@ -34,7 +34,8 @@ class VariancesAndSlopesOfAxes(NamedTuple):
     avar: Floats  # [axes, m] Allan variance
     terms: Floats  # [axes, m] number of averaged second differences
     slope: Floats  # [axes] slope of the rate; NaN means not measured
-    slopes: Floats  # [axes, m] slope of the rate at each τ
+    slopes: Floats  # [axes, m] slope of the rate at each τ; NaN if too many samples are missing
+    excess: Floats  # [axes, m] contribution of missing samples that has been subtracted from the mean square
 
 
 class FitOptions(NamedTuple):
@@ -77,7 +78,9 @@ class LeastSquares(NamedTuple):
     """Weighted least-squares problem of one axis, with its weights and normal equations."""
 
     level: Floats  # [m] observations y: Allan variances without the contribution of the slope
-    stretch: Floats  # [m] square root of the ratio of all second differences to complete second differences
+    excess: Floats  # [m] contribution of missing samples that has been subtracted from the mean squares
+    extra_white: Floats  # [m] N of white noise that contributes as much as the missing samples
+    stretch: Floats  # [m] square root of the ratio of all second differences to those that count
     columns: Floats  # [m, 5] design matrix X
     covariance: Floats  # [m, m, 10] field ``CovarianceTable.covariance``
     ignored_direction: Floats  # [m] change of y that must not affect the fit; its outer product is added to V

@@ -23,9 +23,12 @@ Q, N, B, K, R = range(5)
 
 
 @compiled
-def _allan_covariance(theta: Floats, c: Floats) -> float:
-    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances; a negative Q² counts as zero."""
-    q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
+def _allan_covariance(theta: Floats, extra: float, c: Floats) -> float:
+    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances; a negative Q² counts as zero.
+
+    ``extra`` is added to N². It represents the white noise that missing samples add to the means of clusters.
+    """
+    q, n, b, k = max(theta[0], 0.0), theta[1] + extra, theta[2], theta[3]
     return float(
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
         + n * (n * c[4] + 2.0 * (b * c[5] + k * c[6]))
@@ -48,8 +51,8 @@ def compute_observation_variances(problem: LeastSquares, tau_indices: Ints, thet
         Squared coefficients of the noise model.
     """
     for i in tau_indices:
-        stretch = problem.stretch[i]
-        problem.variance[i] = _allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
+        stretch, extra = problem.stretch[i], problem.extra_white[i]
+        problem.variance[i] = _allan_covariance(theta, extra * extra, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
@@ -80,14 +83,14 @@ def compute_weights(problem: LeastSquares, tau_indices: Ints, theta: Floats, ful
 def _whiten(problem: LeastSquares, tau_indices: Ints, theta: Floats) -> bool:
     """Compute V⁻¹ X by Cholesky decomposition, and return False if the correlation matrix is singular."""
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
-    _, stretch, columns, covariance, ignored_direction, variance, weighted, _, _ = problem
+    _, _, extra, stretch, columns, covariance, ignored_direction, variance, weighted, _, _ = problem
     m = tau_indices.size
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
             i, h = tau_indices[k], tau_indices[j]
             x = (
-                _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h]
+                _allan_covariance(theta, extra[i] * extra[h], covariance[i, h]) * stretch[i] * stretch[h]
                 + ignored_direction[i] * ignored_direction[h]
             )
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
@@ -115,7 +118,9 @@ def compute_normal_equations(problem: LeastSquares, tau_indices: Ints) -> None:
     tau_indices : ndarray of int64
         Indices of the τ to use.
     """
-    level, _, columns, _, _, _, weighted, normal, right = problem
+    level, columns, weighted, normal, right = (
+        problem.level, problem.columns, problem.weighted, problem.normal, problem.right
+    )  # fmt: skip
     for a in range(5):
         right[a] = 0.0
         for b in range(a + 1):

@@ -20,7 +20,6 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.minimization import minimize_by_golden_section
-from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
 from monitor.estimation.fit.coefficient_fit import (
     DesignMatrix,
@@ -57,6 +56,8 @@ MAX_SCATTER: Final = 2.0
 """Largest mean squared residual of the fit with an accepted filter, relative to the expected variance."""
 POWER_BINS: Final = 1024
 """Number of bins of the measured power spectrum from zero to half the sample rate."""
+MIN_PRESENT_SHARE: Final = 0.98
+"""Minimum share of the samples in a segment that must be present to compute its spectrum."""
 MAX_STRETCHES: Final = 64
 """Maximum number of segments of the recording over which a power spectrum is averaged."""
 MIN_STRETCHES: Final = 4
@@ -210,7 +211,9 @@ def refit_with_low_passes(
 def _bound_q(design: DesignMatrix, fit: Fit, measured: MeasuredVariancesAndSlopes) -> None:
     """Compute an upper bound of Q from the Allan variance at the shortest τ."""
     c, first = fit.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
-    most = avar_upper_limit(measured.avar[first, 0], fit.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
+    excess = 0.0 if measured.excess is None else measured.excess[first, 0]
+    most = avar_upper_limit(measured.avar[first, 0], excess, fit.edf[first, 0], UPPER_BOUND_Z)
+    most /= design.columns[first, Q]
     if np.isfinite(most):
         c.status[Q], c.lo[Q], c.hi[Q] = Status.UPPER_BOUND, 0.0, most**0.5 / design.rate_hz
 

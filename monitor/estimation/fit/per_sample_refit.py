@@ -30,6 +30,8 @@ from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
+    LAST_MISSING,
+    MAX_ROUNDING_SQUARE,
     NEWEST,
     STAGE_SAMPLES,
     TOTAL,
@@ -37,6 +39,7 @@ from monitor.estimation.allan.window_kernel import (
     WindowBuffers,
     append_staged_samples,
     compiled_view_window_arrays,
+    compute_variances_of_axis,
     integer_slope_from_thirds,
     mean_rate_slope,
 )
@@ -96,8 +99,8 @@ class ContinuousRefit:
 
     def __init__(self, window: AllanWindow, rows: int, tables: CovarianceTablesByAxis) -> None:
         self._window, self._rows, self._tables = window, rows, tables
-        avar, terms, slopes = np.zeros((3, AXES, rows))
-        self._curves = VariancesAndSlopesOfAxes(avar, terms, np.zeros(AXES), slopes)
+        avar, terms, slopes, excess = np.zeros((4, AXES, rows))
+        self._curves = VariancesAndSlopesOfAxes(avar, terms, np.zeros(AXES), slopes, excess)
         self._ages = np.zeros(AXES, np.int64)
         self.restart_all_fits()
 
@@ -196,6 +199,7 @@ def _follow(
     memory, taus, window = buffers
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
     counters, phase, missing, scaling, terms, slope = w.state, w.phase, w.missing, w.scaling, curves.terms, curves.slope
+    grid = np.count_nonzero(w.first == 0)  # number of cluster sizes of the fit, and powers of two between them
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
     unit, inverse = np.empty((AXES, m)), np.empty((AXES, m))
@@ -214,13 +218,15 @@ def _follow(
                 integer_slope_from_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
             )
         _project(w, scale, curves, maps, right)
+        if counters[TOTAL] - counters[LAST_MISSING] <= window:
+            _subtract_excess(w, grid, maps, right)
         _apply_maps(right, slope, maps, output, valid)
         for axis in range(AXES):
             ages[axis] += 1
             solved = used[axis, 1] > used[axis, 0]
             patience = REFRESH if solved and not free[axis] and misfit[axis] == 1.0 else PATIENCE
             if (solved and not valid[axis]) or ages[axis] * patience > lengths[axis]:
-                _copy_curve(w, scale, curves, axis, lengths[axis])
+                _copy_curve(w, grid, scale, curves, axis, lengths[axis])
                 due |= 1 << axis
                 ages[axis] = 0
             for a in range(5):
@@ -233,15 +239,19 @@ def _follow(
 
 @compiled
 def _copy_curve(
-    w: WindowArrays, scale: SumsToVariances, curves: VariancesAndSlopesOfAxes, axis: int, length: int
+    w: WindowArrays, grid: int, scale: SumsToVariances, curves: VariancesAndSlopesOfAxes, axis: int, length: int
 ) -> None:
+    avar, excess, share = np.empty((3, w.factors.size))
+    compute_variances_of_axis(w, axis, grid, avar, excess, share)
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
         total, count = w.sums[at] + w.rest[at], w.terms[at]
         curves.terms[axis, i] = count
         scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * count)
         # Smaller sums can be caused by rounding alone, as in AllanWindow.avar.
-        curves.avar[axis, i] = total * scale.inverse[axis, i] if total > count else 0.0
+        limit = MAX_ROUNDING_SQUARE if w.excess[at] != 0 else 1.0
+        curves.avar[axis, i] = total * scale.inverse[axis, i] - excess[i] if total > limit * count else 0.0
+        curves.excess[axis, i] = excess[i]
         bend = mean_rate_slope(w.phase, w.missing, w.state[NEWEST], length, w.factors[i], axis)
         curves.slopes[axis, i] = bend / w.scaling[axis]
 
@@ -270,6 +280,19 @@ def _project(
         right[axis, U1] = n - s * (s * ramp[axis, U1] + twist[axis, U1])
         right[axis, U2] = b - s * (s * ramp[axis, U2] + twist[axis, U2])
         right[axis, U3] = k - s * (s * ramp[axis, U3] + twist[axis, U3])
+
+
+@compiled
+def _subtract_excess(w: WindowArrays, grid: int, maps: SolutionMaps, right: Floats) -> None:
+    """Subtract the contribution of missing samples to the mean squares from the right-hand sides."""
+    avar, excess, share = np.empty((3, w.factors.size))
+    rows, used = maps.rows, maps.used
+    for axis in range(AXES):
+        if used[axis, 1] > used[axis, 0]:
+            compute_variances_of_axis(w, axis, grid, avar, excess, share)
+            for i in range(used[axis, 0], used[axis, 1]):
+                for a in range(NOISES):
+                    right[axis, a] -= rows[axis, i, a] * excess[i]
 
 
 @inlined

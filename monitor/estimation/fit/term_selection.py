@@ -25,6 +25,7 @@ from monitor.estimation.fit.fit_kernel_types import (
 )
 from monitor.estimation.fit.least_squares import (
     K,
+    N,
     Q,
     R,
     compute_normal_equations,
@@ -76,7 +77,7 @@ def select_terms(
             continue
         _map_to_term(a, inverse, problem, rows, gain[a])
         tests.estimate[a] = _estimate(gain[a], problem, rows)
-    forms = _variance_forms(0, count, gain, rows, terms.theta, problem.covariance)
+    forms = _variance_forms(0, count, gain, rows, terms.theta, problem)
     for a in range(NOISES):
         tests.enter_limit[a], tests.absent_variance[a] = np.inf, misfit * forms[a, 0]
     for a in range(count):
@@ -133,8 +134,8 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
     """
     m = problem.level.size
     own = LeastSquares(
-        problem.level, problem.stretch, problem.columns, problem.covariance, problem.ignored_direction,
-        np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
+        problem.level, problem.excess, problem.extra_white, problem.stretch, problem.columns, problem.covariance,
+        problem.ignored_direction, np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     supposed, gain, inverse = np.empty(5), np.empty((1, rows.size)), np.empty((5, 5))
     for a in range(NOISES):
@@ -147,7 +148,7 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
         compute_normal_equations(own, rows)
         if invert_on_subset(own.normal, ALL_NOISES, inverse):
             _map_to_term(a, inverse, own, rows, gain[0])
-            c = _variance_forms(a, a + 1, gain, rows, terms.theta, own.covariance)[0]
+            c = _variance_forms(a, a + 1, gain, rows, terms.theta, own)[0]
             estimate = max(_estimate(gain[0], own, rows), 0.0)
             terms.hi[a] = confidence_interval_end(estimate, misfit * c[0], misfit * c[1], c[2], -UPPER_BOUND_Z)
 
@@ -175,16 +176,22 @@ def _map_to_term(a: int, inverse: Floats, problem: LeastSquares, rows: Ints, gai
 
 
 @compiled
-def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Floats, covariance: Floats) -> Floats:
-    """Return c0, c1 and c2 of the variance of û for the coefficients first ≤ a < end."""
-    q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
+def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Floats, problem: LeastSquares) -> Floats:
+    """Return c0, c1 and c2 of the variance of û for the coefficients first ≤ a < end.
+
+    White noise that missing samples add does not depend on the coefficient a, whichever coefficient that is.
+    """
+    covariance, extra_white = problem.covariance, problem.extra_white
+    q, b, k = max(theta[0], 0.0), theta[2], theta[3]
     forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
     for i in range(rows.size):
         for j in range(i + 1):
             c = covariance[rows[i], rows[j]]
+            extra = extra_white[rows[i]] * extra_white[rows[j]]
+            n = theta[1] + extra
             own[0], own[1], own[2], own[3] = c[0], c[4], c[7], c[9]
             bent[0] = n * c[1] + b * c[2] + k * c[3]
-            bent[1] = q * c[1] + b * c[5] + k * c[6]
+            bent[1] = q * c[1] + b * c[5] + k * c[6] + extra * c[4]
             bent[2] = q * c[2] + n * c[5] + k * c[8]
             bent[3] = q * c[3] + n * c[6] + b * c[8]
             others = n * (n * c[4] + b * c[5] + k * c[6]) + b * (n * c[5] + b * c[7] + k * c[8])
@@ -209,7 +216,7 @@ def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Float
 
 @compiled
 def update_ramp_selection(
-    slope: float, slope_variance: Floats, options: FitOptions, terms: TermResults
+    slope: float, extra_white: float, slope_variance: Floats, options: FitOptions, terms: TermResults
 ) -> tuple[float, float, bool]:
     """Include R in the fit if the slope of the rate is significantly larger than noise alone would cause.
 
@@ -217,6 +224,8 @@ def update_ramp_selection(
     ----------
     slope : float
         Slope of the rate per sample interval; NaN means not measured.
+    extra_white : float
+        N² of white noise that missing samples add to the means of long clusters.
     slope_variance : ndarray of float64, shape (4,)
         Variance of the slope for each unit coefficient.
     options : FitOptions
@@ -236,7 +245,7 @@ def update_ramp_selection(
     theta, status = terms.theta, terms.status
     if slope != slope:
         return 0.0, np.nan, bool(status[K] == 2)
-    noise = 0.0
+    noise = extra_white * slope_variance[N]
     for a in range(NOISES):
         noise += max(theta[a], 0.0) * slope_variance[a]
     most = noise + (terms.hi[K] ** 2 - theta[K]) * slope_variance[K] if status[K] > 0 else noise

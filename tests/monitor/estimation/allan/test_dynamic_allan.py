@@ -49,6 +49,7 @@ def test_every_step_equals_a_batch_over_its_window() -> None:
     values = simulate_jump(1)[20_000:32_000]
     values[:, 5] += 9.81
     values[[500, 4321]] = np.nan
+    values[np.random.default_rng(2).random(len(values)) < 0.03, 2:] = np.nan
     found = compute_dynamic_allan(values, RATE_HZ, 40.0, "octave", 7.0)
     length, step = 4000, 700
     factors = batch.cluster_sizes(length, RATE_HZ)
@@ -59,16 +60,16 @@ def test_every_step_equals_a_batch_over_its_window() -> None:
     assert found.window_s == 40.0
     for row, end in enumerate(range(length, 12_001, step)):
         window = values[end - length : end]
-        avar, terms = batch.overlapping_avar(window, factors)
+        avar, terms, excess = batch.overlapping_allan_variances(window, factors)
         slope, slopes = (
             batch.rate_slope_from_thirds(window) * RATE_HZ,
             batch.rate_slope_per_tau(window, factors) * RATE_HZ,
         )
         expected = fit_coefficients(
-            columns, covariances, MeasuredVariancesAndSlopes(avar, terms, slope, slopes, entered)
+            columns, covariances, MeasuredVariancesAndSlopes(avar, terms, slope, slopes, entered, excess)
         )
         entered = expected.entered
-        lo, hi = deviation_intervals(avar, expected.edf)
+        lo, hi = deviation_intervals(avar, expected.edf, excess=excess)
         assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)
         # The window interpolates the slopes of long τ from a grid, which changes the fit slightly.
         assert found.lo[row] == pytest.approx(lo, rel=5e-3, nan_ok=True)

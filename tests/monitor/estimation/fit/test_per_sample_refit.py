@@ -43,11 +43,11 @@ def fit_window_anew(window, before):
     n = window.samples_in_window
     table = CovarianceTablesByAxis(FACTORS, LENGTH).table_of_axis(0, n, n)
     slope, slopes = window.drift_slopes_by_axis_and_tau()
-    avar, terms = window.avar(), window.term_counts()
+    avar, terms, excess = window.variances()
     return fit_coefficients(
         DESIGN,
         table,
-        MeasuredVariancesAndSlopes(avar, terms, slope * RATE_HZ, slopes * RATE_HZ, before),
+        MeasuredVariancesAndSlopes(avar, terms, slope * RATE_HZ, slopes * RATE_HZ, before, excess),
         full_covariance=False,
     )
 
