@@ -209,8 +209,9 @@ def _dynamic_curves(
     rate_hz = result.estimate.rate_hz
     try:
         shown = compute_dynamic_allan(
-            result.values, rate_hz, window_s, tau, progress=lambda share: tell("dynamic curves", share)
-        )
+            result.values, rate_hz, window_s, tau, progress=lambda share: tell("dynamic curves", share),
+            pauses=result.pauses,
+        )  # fmt: skip
     except NotReady as error:
         return None, f"no dynamic curves: {error}"
     return shown, ""

@@ -8,7 +8,7 @@ motion. The search for events always ignores samples in motion.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +17,7 @@ from drivers.data_types import Floats, Ints, SampleBlock
 from drivers.errors import NotReady
 from monitor.estimation import analysis_notes
 from monitor.estimation.allan.batch import (
+    NO_PAUSES,
     EachAxis,
     TauGrid,
     cluster_sizes,
@@ -42,7 +43,7 @@ from monitor.estimation.fit.low_pass_search import (
     power_spectrum,
     refit_with_low_passes,
 )
-from monitor.estimation.regular_grid import place_samples_on_grid
+from monitor.estimation.regular_grid import place_samples_and_pauses_on_grid
 
 MIN_SAMPLES: Final = 50
 """Minimum number of samples that a recording must contain."""
@@ -62,6 +63,7 @@ class RecordingAnalysis:
     bandwidth_hz: Floats  # [6] cutoff frequency of the sensor's low-pass filter; NaN if no filter has been found
     motions: tuple[MotionEpisode, ...] = ()
     changes: tuple[Change, ...] = ()
+    pauses: Ints = field(default_factory=lambda: NO_PAUSES)  # rows of ``values`` that stand for a long gap
     motion_removed: bool = False  # True if ``values`` contains no samples in motion
     axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the bias variance
 
@@ -99,14 +101,15 @@ def analyze(
     ConfigError
         If every averaging time is shorter than one sample or longer than half the recording.
     """
-    values, rate, found = place_samples_on_grid(blocks, rate_hz)
+    values, pauses, rate, found = place_samples_and_pauses_on_grid(blocks, rate_hz)
     if len(values) < MIN_SAMPLES:
         raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed for an analysis")
     motions: tuple[MotionEpisode, ...] = ()
     if remove_motion:
         values, motions = _without_motion(values, rate)
         found = [*found, *analysis_notes.describe_motions(motions, rate, removed=True)]
-    curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes)
+    curve, fitted, filters, cost = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes, pauses)
+    found = [*found, *cost]
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
         curve, fitted.fitted, fitted.coefficients, fitted.k_or_r, poorly_fitted_axes=fitted.poorly_fitted_axes,
@@ -125,6 +128,7 @@ def analyze(
         bandwidth_hz,
         motions,
         motion_removed=remove_motion,
+        pauses=pauses,
     )
 
 
@@ -168,7 +172,8 @@ def fit_other_samples(result: RecordingAnalysis, samples: Floats) -> Fit:
     samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s², for example after temperature compensation; NaN means missing.
     """
-    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, map)
+    rate, factors = result.estimate.rate_hz, result.estimate.curve.factors
+    _, found, _, _ = _fit_curve(samples, rate, factors, map, result.pauses)
     return found
 
 
@@ -181,10 +186,11 @@ def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motio
 
 
 def _fit_curve(
-    values: Floats, rate_hz: float, factors: Ints, each: EachAxis
-) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
+    values: Floats, rate_hz: float, factors: Ints, each: EachAxis, pauses: Ints
+) -> tuple[AllanCurve, Fit, list[LowPass | None], list[str]]:
+    """Fit the noise coefficients, and describe by how much missing samples widen the intervals."""
     n = len(values)
-    avar, terms, excess = overlapping_allan_variances(values, factors, each)
+    avar, terms, excess = overlapping_allan_variances(values, factors, each, pauses)
     columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(n, factors)
     measured = MeasuredVariancesAndSlopes(
         avar, terms, rate_slope_from_thirds(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz,
@@ -197,7 +203,12 @@ def _fit_curve(
         else None
         for axis, contradicts in enumerate(axes_contradicting_five_terms(found))
     ]
+    cost: list[str] = []
+    if (terms < covariances.terms[:, None]).any() or excess.any():
+        whole = np.where(terms > 0, covariances.terms[:, None], 0)
+        complete = fit_coefficients(columns, covariances, replace(measured, terms=whole, excess=None))
+        cost = analysis_notes.describe_loss(values, found.coefficients, complete.coefficients)
     found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
     lo, hi = deviation_intervals(avar, found.edf, excess=excess)
     curve = AllanCurve(factors / rate_hz, factors, np.maximum(avar, 0.0), terms, found.edf, lo, hi, n)
-    return curve, found, filters
+    return curve, found, filters, cost

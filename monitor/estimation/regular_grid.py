@@ -38,7 +38,8 @@ MIN_REPEATED_SHARE: Final = 0.01
 MAX_GAP_SAMPLES: Final = 1_000_000
 """Maximum number of missing samples that are stored for one gap, at 48 bytes per sample.
 
-A longer gap is replaced by one missing sample, which still excludes all differences across the gap.
+A longer gap is replaced by one missing sample. ``place_samples_and_pauses_on_grid`` returns its row, because no cluster
+may contain samples from both sides of the gap.
 """
 SEGMENTS: Final = 8
 """Number of segments into which a recording is divided to compute the standard error of the mean rate."""
@@ -71,6 +72,29 @@ def place_samples_on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) 
     """
     _, _, values, rate, notes = _resample(blocks, rate_hz)
     return values, rate, notes
+
+
+def place_samples_and_pauses_on_grid(
+    blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> tuple[Floats, Ints, float, list[str]]:
+    """Place the samples of a recording on a regular time grid, and find the rows that stand for a long gap.
+
+    Parameters
+    ----------
+    blocks, rate_hz
+        See ``place_samples_on_grid``.
+
+    Returns
+    -------
+    values, rate_hz, notes
+        See ``place_samples_on_grid``.
+    pauses : ndarray of int64
+        Rows that replace a gap of more than ``MAX_GAP_SAMPLES`` samples, returned after ``values``.
+    """
+    stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
+    begins = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
+    stored = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
+    return values, (begins + np.cumsum(stored) - stored)[lost > MAX_GAP_SAMPLES], rate, notes
 
 
 def place_samples_and_temperature_on_grid(
@@ -189,7 +213,7 @@ def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
     if short.size:
         samples = "1 sample is" if short.sum() == 1 else f"{short.sum()} samples are"
         places = "1 place" if short.size == 1 else f"{short.size} places"
-        notes.append(f"{samples} missing in {places}; differences that contain them are left out")
+        notes.append(f"{samples} missing in {places}")
     return notes
 
 

@@ -23,7 +23,6 @@ from collections.abc import Callable, Iterable
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
@@ -42,6 +41,7 @@ TauGrid = Literal["octave", "decade10"] | tuple[float, ...]
 EachAxis = Callable[[Callable[[Floats], AllanVariances], Iterable[Floats]], Iterable[AllanVariances]]
 """Type of the built-in function ``map`` and of the method ``map`` of a thread pool."""
 
+NO_PAUSES: Final = np.empty(0, np.int64)
 BLOCK: Final = 16_384
 """Number of phase points in a block. Three blocks, 0.4 MB in total, fit into a second-level cache."""
 LANES: Final = 512
@@ -84,17 +84,26 @@ def overlapping_avar_axis(rate: Floats, factors: Ints) -> tuple[Floats, Ints]:
     return np.maximum(avar, 0.0), terms
 
 
-def overlapping_allan_variances(values: Floats, factors: Ints, map_axes: EachAxis = map) -> AllanVariances:
+def overlapping_allan_variances(
+    values: Floats, factors: Ints, map_axes: EachAxis = map, pauses: Ints = NO_PAUSES
+) -> AllanVariances:
     """Return the overlapping Allan variances of rates, corrected for missing samples.
 
-    The method is described in ``missing_samples``. The parameters are those of ``overlapping_avar``. The corrected
-    Allan variance is unbiased. It may be negative if missing samples contribute most of the mean square.
+    The method is described in ``missing_samples``. The corrected Allan variance is unbiased. It may be negative if
+    missing samples contribute most of the mean square.
+
+    Parameters
+    ----------
+    values, factors, map_axes
+        See ``overlapping_avar``.
+    pauses : ndarray of int64
+        Rows of missing samples that represent a pause of any length. No cluster that contains such a row counts.
     """
-    columns = list(map_axes(lambda column: _allan_variances_of_axis(column, factors), values.T))
+    columns = list(map_axes(lambda column: _allan_variances_of_axis(column, factors, pauses), values.T))
     return AllanVariances(*(np.stack(parts, axis=1) for parts in zip(*columns, strict=True)))
 
 
-def _allan_variances_of_axis(rate: Floats, factors: Ints) -> AllanVariances:
+def _allan_variances_of_axis(rate: Floats, factors: Ints, pauses: Ints = NO_PAUSES) -> AllanVariances:
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0
     phase[1:] = rate  # copied to float64, because sums in float32 would be too inaccurate
@@ -106,7 +115,9 @@ def _allan_variances_of_axis(rate: Floats, factors: Ints) -> AllanVariances:
         _add_complete(phase, m, lanes, terms)
         with np.errstate(invalid="ignore"):  # 0/0 if no second difference exists
             return AllanVariances(lanes.sum(axis=1) / (2.0 * m * m * terms), terms, np.zeros(m.size))
-    missing = np.cumsum(absent, dtype=np.int32)
+    missing = absent.astype(np.int64)
+    missing[pauses + 1] = len(rate)
+    np.cumsum(missing, out=missing)
     within = variance_within_clusters(m, np.full(m.size, len(rate)))
     all_m = within.factors
     lanes, extra, terms = *np.zeros((2, all_m.size, LANES)), np.zeros(all_m.size, np.int64)
@@ -295,9 +306,7 @@ def _add_complete(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> N
 
 
 @compiled
-def _add_with_missing(
-    phase: Floats, missing: NDArray[np.int32], factors: Ints, lanes: Floats, extra: Floats, terms: Ints
-) -> None:
+def _add_with_missing(phase: Floats, missing: Ints, factors: Ints, lanes: Floats, extra: Floats, terms: Ints) -> None:
     """Add the squared differences that count to ``lanes``, and their values m/n_A + m/n_B − 2 to ``extra``."""
     for begin in range(0, phase.size, BLOCK):
         end = min(begin + BLOCK, phase.size)
@@ -345,9 +354,7 @@ def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> 
 
 
 @compiled
-def _add_incomplete(
-    phase: Floats, missing: NDArray[np.int32], first: int, end: int, m: int, lanes: Floats, extra: Floats
-) -> int:
+def _add_incomplete(phase: Floats, missing: Ints, first: int, end: int, m: int, lanes: Floats, extra: Floats) -> int:
     """Add the squares of the differences first ≤ i < end that count, and return their number."""
     most, count = m - min_present(m), 0
     for row in range(first, end, LANES):

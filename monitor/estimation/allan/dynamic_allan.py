@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.data_types import Floats
+from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError, NotReady
-from monitor.estimation.allan.batch import TauGrid, cluster_sizes
+from monitor.estimation.allan.batch import NO_PAUSES, TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
 from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
@@ -59,6 +59,7 @@ def compute_dynamic_allan(
     tau: TauGrid = "octave",
     step_s: float | None = None,
     progress: Progress | None = None,
+    pauses: Ints = NO_PAUSES,
 ) -> DynamicAllan:
     """Compute the dynamic Allan variance and the noise coefficients of a recording with a constant sample rate.
 
@@ -77,6 +78,8 @@ def compute_dynamic_allan(
         if the number of steps would exceed ``MAX_STEPS``.
     progress : Progress or None
         Function that is called with the completed fraction of the computation, from 0 to 1.
+    pauses : ndarray of int64
+        Rows of missing samples that represent a pause of any length. No cluster that contains such a row counts.
 
     Raises
     ------
@@ -103,6 +106,11 @@ def compute_dynamic_allan(
     entered = np.zeros((5, axes), np.bool_)
     start = 0
     for row, end in enumerate(ends.tolist()):
+        for pause in pauses[(pauses >= start) & (pauses < end)].tolist():
+            window.append_samples(values[start : pause + 1])
+            for axis in range(axes):
+                window.keep_newest(axis, 0)
+            start = pause + 1
         window.append_samples(values[start:end])
         start = end
         (avar, terms, excess), (slope, slopes) = window.variances(), window.drift_slopes_by_axis_and_tau()

@@ -307,29 +307,60 @@ def _replace_incomplete(
     """Replace the squares of differences with missing samples, and add the terms ``step`` times to the counts.
 
     The square is zero if too few samples of a cluster are present. Usually, the same samples are missing on all axes,
-    so the two divisions are repeated only if the numbers of missing samples change.
+    so the number of missing samples is compared once for all axes, and the divisions are repeated only if it changes.
     """
-    most, older, newer, extra, counted = m - min_present(m), 0, 0, 0, True
+    most, older, newer, extra = m - min_present(m), 0, 0, 0
     share_a = share_b = 1.0 / m
-    for i in range(rows * LANES):
-        if i % LANES >= AXES:
-            continue
-        i0, i1, i2 = at0 * LANES + i, at1 * LANES + i, at2 * LANES + i
+    shared_terms, shared_excess = 0, 0
+    lanes = np.uintp(LANES)
+    for row in range(rows):
+        i0, i1, i2 = np.uintp(at0 + row) * lanes, np.uintp(at1 + row) * lanes, np.uintp(at2 + row) * lanes
+        out = np.uintp(row) * lanes
         a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
-        if a != older or b != newer:
-            older, newer = a, b
-            counted = a <= most and b <= most
-            if counted:
+        differs = 0
+        for lane in range(np.uintp(1), np.uintp(AXES)):
+            differs |= missing_between(missing, i1 + lane, i2 + lane) ^ a
+            differs |= missing_between(missing, i0 + lane, i1 + lane) ^ b
+        if differs == 0:
+            if a == 0 and b == 0:
+                shared_terms += step
+                continue
+            if a > most or b > most:
+                squares[out : out + lanes] = 0.0
+                continue
+            if a != older or b != newer:
+                older, newer = a, b
                 share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
                 extra = step * _excess_of_term(a, b, share_a, share_b)
-        if not counted:
-            squares[i] = 0.0
+            shared_terms += step
+            shared_excess += extra
+            for lane in range(lanes):
+                x1 = phase[i1 + lane]
+                d = (
+                    difference_of_means(x1 - phase[i2 + lane], phase[i0 + lane] - x1, m - a, m - b, share_a, share_b)
+                    * m
+                )
+                squares[out + lane] = d * d
             continue
-        terms[i % LANES] += step
-        if a != 0 or b != 0:
-            d = difference_of_means(phase[i1] - phase[i2], phase[i0] - phase[i1], m - a, m - b, share_a, share_b) * m
-            squares[i] = d * d
-            excess[i % LANES] += extra
+        for lane in range(np.uintp(AXES)):
+            a = missing_between(missing, i1 + lane, i2 + lane)
+            b = missing_between(missing, i0 + lane, i1 + lane)
+            if a > most or b > most:
+                squares[out + lane] = 0.0
+                continue
+            if a != older or b != newer:
+                older, newer = a, b
+                share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
+                extra = step * _excess_of_term(a, b, share_a, share_b)
+            terms[lane] += step
+            excess[lane] += extra
+            if a != 0 or b != 0:
+                x0, x1, x2 = phase[i0 + lane], phase[i1 + lane], phase[i2 + lane]
+                d = difference_of_means(x1 - x2, x0 - x1, m - a, m - b, share_a, share_b) * m
+                squares[out + lane] = d * d
+    for lane in range(np.uintp(AXES)):
+        terms[lane] += shared_terms
+        excess[lane] += shared_excess
 
 
 @inlined

@@ -51,11 +51,14 @@ def test_missing_samples_keep_their_positions():
 
 @pytest.mark.parametrize("lost", [1999, 2000, 2001, 10**11])
 def test_gap_of_about_the_window_length_leaves_only_new_samples(lost):
+    """A longer gap empties the window. After a shorter gap, clusters at its end are partly filled with new samples."""
     estimator = Estimator(RATE, 20.0)
     estimator.add_samples(make_samples(0, 3000))
     estimator.add_samples(make_samples(5000, 300, lost=lost))
     found = estimator.get_estimate()
-    expected, terms = overlapping_avar(make_samples(5000, 300).values, found.curve.factors)
+    before = np.full((1700 if lost <= 2000 else 0, 6), np.nan)
+    values = np.concatenate([before, make_samples(5000, 300).values])
+    expected, terms = overlapping_avar(values, found.curve.factors)
     assert np.array_equal(found.curve.terms, terms)
     assert found.curve.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
     assert found.samples == 3300
