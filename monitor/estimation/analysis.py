@@ -210,5 +210,5 @@ def _fit_curve(
         cost = analysis_notes.describe_loss(values, found.coefficients, complete.coefficients)
     found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
     lo, hi = deviation_intervals(avar, found.edf, excess=excess)
-    curve = AllanCurve(factors / rate_hz, factors, np.maximum(avar, 0.0), terms, found.edf, lo, hi, n)
+    curve = AllanCurve(factors / rate_hz, factors, np.maximum(avar, 0.0), terms, found.edf, lo, hi, n, excess)
     return curve, found, filters, cost

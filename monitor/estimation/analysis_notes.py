@@ -285,7 +285,8 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = curve.avar[:, axis] / model
+        excess = np.broadcast_to(curve.excess, curve.avar.shape)[:, axis]
+        ratio = (curve.avar[:, axis] + excess) / (model + excess)
         sigma = (np.cbrt(ratio) - 1.0) * np.sqrt(4.5 * edf)  # Wilson & Hilferty 1931
         off = np.where(np.abs(sigma) > DEPARTURE_SIGMA, np.log(ratio), 0.0)
     worst = int(off.argmax()) if (off > 0.0).any() else int(off.argmin())

@@ -228,7 +228,7 @@ class Estimator:
         avar = np.maximum(avar, 0.0)
         tau_s = self._factors / self.rate_hz
         curve, quick = (
-            AllanCurve(tau_s, self._factors, avar[rows], terms[rows], edf[rows], lo[rows], hi[rows], n)
+            AllanCurve(tau_s, self._factors, avar[rows], terms[rows], edf[rows], lo[rows], hi[rows], n, excess[rows])
             for rows in (own, recent)
         )
         history = concatenate_successive_coefficients(self._history)

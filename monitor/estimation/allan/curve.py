@@ -13,10 +13,12 @@ class AllanCurve:
     factors: Ints  # [m] cluster sizes in samples
     avar: Floats  # [m, 6] Allan variance in squared units of the axis; NaN if the window is too short
     terms: Ints  # [m, 6] number of averaged second differences
-    edf: Floats  # [m, 6] equivalent degrees of freedom; NaN where ``avar`` is NaN
+    edf: Floats  # [m, 6] equivalent degrees of freedom of ``avar`` + ``excess``; NaN where ``avar`` is NaN
     lo: Floats  # [m, 6] lower end of the 95 % confidence interval of the Allan deviation
     hi: Floats  # [m, 6] upper end of the 95 % confidence interval of the Allan deviation
     n: int  # number of samples in the window, including missing samples
+    # [m, 6] contribution of missing samples that has been subtracted from the mean squares, see ``missing_samples``
+    excess: Floats | float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,9 +127,9 @@ class LiveTotalAndHadamard:
         n = ring.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
         inner = np.flatnonzero((self._window.factors == m) & (self._window.spans == self._window.length))
-        # the sliding window also counts differences of clusters with missing samples
-        whole = (ring.missing[ring.first] == ring.missing[(ring.first + n) % len(ring.missing)]).all()
-        if inner.size and 2 * m <= n and whole:
+        # the sums of the sliding window also contain clusters with missing samples
+        lost = ring.missing[(ring.first + n) % len(ring.missing)] - ring.missing[ring.first]
+        if inner.size and 2 * m <= n and np.isin(lost, (0, n)).all():
             row = inner[0]
             terms += self._window.term_counts()[row]
             sums += np.nan_to_num(self._window.avar()[row]) * terms * 2.0 * (m / unit) ** 2

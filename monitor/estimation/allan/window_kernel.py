@@ -317,11 +317,7 @@ def _replace_incomplete(
         i0, i1, i2 = np.uintp(at0 + row) * lanes, np.uintp(at1 + row) * lanes, np.uintp(at2 + row) * lanes
         out = np.uintp(row) * lanes
         a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
-        differs = 0
-        for lane in range(np.uintp(1), np.uintp(AXES)):
-            differs |= missing_between(missing, i1 + lane, i2 + lane) ^ a
-            differs |= missing_between(missing, i0 + lane, i1 + lane) ^ b
-        if differs == 0:
+        if _all_axes_lack(missing, i0, i1, i2, a, b):
             if a == 0 and b == 0:
                 shared_terms += step
                 continue
@@ -361,6 +357,16 @@ def _replace_incomplete(
     for lane in range(np.uintp(AXES)):
         terms[lane] += shared_terms
         excess[lane] += shared_excess
+
+
+@inlined
+def _all_axes_lack(missing: NDArray[np.int32], i0: int, i1: int, i2: int, older: int, newer: int) -> bool:
+    """Return True if the same numbers of samples are missing in the two clusters on all axes."""
+    differs = 0
+    for lane in range(np.uintp(1), np.uintp(AXES)):
+        differs |= missing_between(missing, i1 + lane, i2 + lane) ^ older
+        differs |= missing_between(missing, i0 + lane, i1 + lane) ^ newer
+    return differs == 0
 
 
 @inlined

@@ -29,7 +29,7 @@ import numpy as np
 from drivers.data_types import AXES, Event, Floats, Ints
 from monitor.common.distributions import normal_quantile
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.uncertainty import NOISES, PAIRS, CovarianceTable, CovarianceTablesByAxis, K
+from monitor.estimation.allan.uncertainty import NOISES, PAIRS, CovarianceTable, CovarianceTablesByAxis, K, N
 from monitor.estimation.estimate import Estimate
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_grid
@@ -115,8 +115,9 @@ class NoiseModelComparator:
             n = count_axis_samples_in_window(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.degrees_of_freedom(tables.table_of_axis(i, n, curve.n), terms)
-            one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
+            excess = np.broadcast_to(curve.excess, curve.avar.shape)[:, i]
+            edf = expected.degrees_of_freedom(tables.table_of_axis(i, n, curve.n), terms, excess)
+            one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, excess, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one
         return ModelComparison(
@@ -174,13 +175,18 @@ class _Expected:
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
         return cls(spectrum.avar(tau_s), shape, more)
 
-    def degrees_of_freedom(self, table: CovarianceTable, terms: Ints) -> Floats:
-        """Return the degrees of freedom [m], with NaN for averaging times without second differences."""
-        pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
-        exact = np.einsum("iik,k->i", table.covariance, pairs)
+    def degrees_of_freedom(self, table: CovarianceTable, terms: Ints, excess: Floats) -> Floats:
+        """Return the degrees of freedom [m] of the mean squares, with NaN for averaging times without differences.
+
+        Missing samples, which add ``excess`` [m] to the mean squares, act like white noise.
+        """
+        shape = np.tile(self.shape, (terms.size, 1))
+        shape[:, N] += np.maximum(excess, 0.0) * table.factors
+        pairs = np.stack([shape[:, a] * shape[:, b] * (1.0 if a == b else 2.0) for a, b in PAIRS], axis=1)
+        exact = np.einsum("iik,ik->i", table.covariance, pairs)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = exact * table.terms / terms + self.more / terms
-            return np.where((terms > 0) & (variance > 0.0), 2.0 * self.avar**2 / variance, np.nan)
+            return np.where((terms > 0) & (variance > 0.0), 2.0 * (self.avar + excess) ** 2 / variance, np.nan)
 
 
 def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
@@ -226,11 +232,11 @@ def _kernel(nu: Floats, m: int) -> Floats:
 
 
 def _axis_gap(
-    axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
+    axis: str, tau_s: Floats, avar: Floats, expected: Floats, excess: Floats, edf: Floats, samples: int, axes: int
 ) -> AxisModelComparison | None:
     """Compare one axis with the noise model, or return None if no averaging time can be compared."""
     expected = np.where(expected > 0.0, expected, np.nan)
-    z = chi2_ratio_to_normal_score(avar / expected, edf)
+    z = chi2_ratio_to_normal_score((avar + excess) / (expected + excess), edf)
     judged = np.isfinite(z)
     if not judged.any():
         return None

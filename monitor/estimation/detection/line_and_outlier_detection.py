@@ -270,7 +270,8 @@ def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: All
 def _allan_share(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
     half = np.pi * turns
     made = (amplitude * np.sin(curve.factors * half) ** 2 / np.sin(half)) ** 2 / curve.factors
-    return np.asarray(made / (curve.factors * curve.avar[:, axis]))
+    mean_square = (curve.avar + curve.excess)[:, axis]  # not zero because of missing samples alone
+    return np.asarray(made / (curve.factors * mean_square))
 
 
 def _outlier_share(part: Floats) -> float:

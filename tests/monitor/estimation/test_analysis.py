@@ -41,6 +41,20 @@ def test_missing_samples_keep_their_positions(rate, rows):
     assert np.array_equal(grid, expected, equal_nan=True)
 
 
+@pytest.mark.parametrize(
+    ("lost", "expected"),
+    [
+        (slice(7, None, 50), r"2 % of the samples are missing: intervals wider by N \d %"),
+        ([4000], "0.0083 % of the samples are missing: intervals hardly wider"),
+    ],
+)
+def test_note_says_which_share_is_missing_and_what_it_costs(lost, expected):
+    kept = np.ones(12_000, bool)
+    kept[lost] = False
+    found = analyze(recorded_blocks(np.flatnonzero(kept) / 100, white(12_000)[kept]), 100.0)
+    assert any(re.fullmatch(expected, note) for note in found.notes), found.notes
+
+
 def test_very_long_gap_is_not_counted_among_the_short_gaps():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])

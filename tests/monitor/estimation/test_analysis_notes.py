@@ -68,7 +68,7 @@ def make_curve_and_fit(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
         avar[at[axis], axis] *= 4.0 if misfit[axis] > 1.0 else 1.0
     status = np.full((5, 6), Status.UPPER_BOUND)
     status[0, list(q)] = Status.ESTIMATED
-    curve = SimpleNamespace(factors=factors, tau_s=factors / RATE_HZ, avar=avar)
+    curve = SimpleNamespace(factors=factors, tau_s=factors / RATE_HZ, avar=avar, excess=0.0)
     fit = SimpleNamespace(
         fitted=fitted, edf=np.full((8, 6), 1e3), misfit=np.array(misfit), left_out=np.array(left_out),
         theta=np.ones((5, 6)), k_or_r=np.zeros(6, bool), coefficients=SimpleNamespace(status=status),
@@ -145,7 +145,7 @@ def test_drift_in_a_short_recording_is_noted_as_k_or_r():
 def test_missing_samples_prevent_separating_k_and_r():
     rng = np.random.default_rng(4)
     values = simulate_white_noise(100_000) + np.cumsum(3e-5 * rng.standard_normal((100_000, 6)), axis=0)
-    values[500:4000] = np.nan
+    values[500:15_000] = np.nan
     found = analyze_values(values)
     [note] = [note for note in found.notes if "K or R" in note]  # one note for all affected axes
     axes = ", ".join(np.array(AXES)[found.fit.k_or_r])
@@ -190,7 +190,7 @@ def test_undisturbed_noise_gives_no_notes():
 
 def test_misfit_range_ends_where_the_curve_agrees_again():
     measured = np.array([1.1, 2.0, 3.0, 1.1, 6.0, 1.0])[:, None]
-    curve = SimpleNamespace(avar=measured)
+    curve = SimpleNamespace(avar=measured, excess=0.0)
     fit = SimpleNamespace(fitted=np.ones((6, 1)), edf=np.array([9e4, 100.0, 100.0, 100.0, 1.0, 10.0])[:, None])
     assert analysis_notes._departure(curve, fit, 0) == (1, 2)  # the first deviates by little, the fifth by chance
 

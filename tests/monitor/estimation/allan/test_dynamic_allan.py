@@ -45,6 +45,19 @@ def simulate_jump(seed: int) -> np.ndarray:
     return np.concatenate([first_part, second_part + level])
 
 
+def test_no_cluster_crosses_a_pause() -> None:
+    """As a pause is longer than a window, only samples after the pause count."""
+    values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
+    values[1400] = np.nan
+    values[1400:] += 1.0
+    values[2200] = np.nan
+    values[2200:] -= 5.0
+    found = compute_dynamic_allan(values, 10.0, 60.0, step_s=7.0, pauses=np.array([1400, 2200]))
+    assert np.nanmax(found.deviation) < 2e-3
+    assert np.isfinite(found.deviation[:, :3]).all()  # longer τ need more samples after the pause
+    assert np.nanmax(compute_dynamic_allan(values, 10.0, 60.0, step_s=7.0).deviation) > 0.1
+
+
 def test_every_step_equals_a_batch_over_its_window() -> None:
     values = simulate_jump(1)[20_000:32_000]
     values[:, 5] += 9.81

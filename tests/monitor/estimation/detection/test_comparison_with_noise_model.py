@@ -175,10 +175,11 @@ def test_restarted_axis_is_compared_by_its_own_samples() -> None:
     assert np.isfinite(comparison.axes["gz"].z).sum() < np.isfinite(comparison.axes["gx"].z).sum()
 
 
-def test_gaps_do_not_cause_disagreement() -> None:
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_gaps_do_not_cause_disagreement(share: float) -> None:
     model = make_model(*FIVE_TERMS)
     values = model.simulate(30_000, RATE, 2)
-    values[np.random.default_rng(1).random(30_000) < 0.01] = np.nan
+    values[np.random.default_rng(1).random(30_000) < share] = np.nan
     comparison = NoiseModelComparator(model, 30_000).compare_with_estimate(estimate_values(values))
     assert list(comparison.axes) == list(AXES)
     assert not any(axis.gap > axis.threshold for axis in comparison.axes.values())

@@ -67,6 +67,20 @@ def test_refit_agrees_with_a_new_fit():
     assert np.sqrt(np.mean(np.square(deviations))) < 0.2
 
 
+@pytest.mark.parametrize("lost_axes", [slice(None), slice(0, 2)])
+def test_refit_agrees_with_a_new_fit_if_samples_are_missing(lost_axes):
+    """Without the correction for missing samples, N² would be 5 % too large, which is 4 standard deviations."""
+    values, rng = simulate_values(22_000, seed=3), np.random.default_rng(4)
+    values[rng.random(len(values)) < 0.05, lost_axes] = np.nan
+    history, window, refit = refit_each_sample(values)
+    coefficients = fit_window_anew(window, refit.terms_in_fit).coefficients
+    both = np.isfinite(history[-1]) & np.isfinite(coefficients.value)
+    assert both[1].all()
+    assert both.sum() >= 12
+    scatter = (coefficients.hi - coefficients.lo)[both] / 4.0
+    assert (np.abs(history[-1] - coefficients.value)[both] < scatter).all()
+
+
 @pytest.mark.parametrize("blocks", [(1,), (7, 100, 3), (513, 2)])
 def test_block_sizes_do_not_change_the_result(blocks):
     values = simulate_values(3000)
