@@ -79,7 +79,9 @@ def variance_within_clusters(factors: Ints, spans: Ints) -> VarianceWithinCluste
     [0.0, 1.0, 1.0, 0.0, 1.0, 1.0]
     """
     edges = [0, *(np.flatnonzero(np.diff(factors) <= 0) + 1).tolist(), factors.size]
-    order, first, parts = [], [], []
+    order: list[Ints] = []
+    first: list[Ints] = []
+    parts: list[Floats] = []
     for begin, end in pairwise(edges):
         own, rows = factors[begin:end], np.arange(begin, end)
         if own[0] > 1 or (own[1:] > 2 * own[:-1]).any():

@@ -220,7 +220,7 @@ class DegreesOfFreedomWithSpanPerTau:
         """
         edf = np.empty(terms.shape)
         # the kernel is compiled only for contiguous arrays
-        theta, terms, excess = (np.ascontiguousarray(part) for part in (theta, terms, excess))
+        theta, terms, excess = np.ascontiguousarray(theta), np.ascontiguousarray(terms), np.ascontiguousarray(excess)
         _fill_edf(theta, rate_hz, self._columns, self._covariance, self._terms, terms, excess, edf)
         return edf
 

@@ -285,7 +285,7 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 
 
 @inlined
-def missing_between(missing: NDArray[np.int32], newer: int, older: int) -> int:
+def missing_between(missing: NDArray[np.int32], newer: int | np.uintp, older: int | np.uintp) -> int:
     """Return the number of missing samples between two elements of the running count, which wraps around."""
     return int(np.int32(missing[newer] - missing[older]))
 
@@ -360,7 +360,9 @@ def _replace_incomplete(
 
 
 @inlined
-def _all_axes_lack(missing: NDArray[np.int32], i0: int, i1: int, i2: int, older: int, newer: int) -> bool:
+def _all_axes_lack(
+    missing: NDArray[np.int32], i0: np.uintp, i1: np.uintp, i2: np.uintp, older: int, newer: int
+) -> bool:
     """Return True if the same numbers of samples are missing in the two clusters on all axes."""
     differs = 0
     for lane in range(np.uintp(1), np.uintp(AXES)):

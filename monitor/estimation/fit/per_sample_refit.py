@@ -199,7 +199,7 @@ def _follow(
     memory, taus, window = buffers
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
     counters, phase, missing, scaling, terms, slope = w.state, w.phase, w.missing, w.scaling, curves.terms, curves.slope
-    grid = np.count_nonzero(w.first == 0)  # number of cluster sizes of the fit, and powers of two between them
+    grid = int(np.count_nonzero(w.first == 0))  # number of cluster sizes of the fit, and powers of two between them
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
     unit, inverse = np.empty((AXES, m)), np.empty((AXES, m))
