@@ -37,14 +37,14 @@ class AllanVariances(NamedTuple):
 class VarianceWithinClusters(NamedTuple):
     """Linear map from the Allan variances at R cluster sizes to the variance V within the clusters.
 
-    Rows and columns of ``weights`` are in the order ``order``.
+    Rows and columns of ``weights`` are in the order ``order``. Each column belongs to one value of V.
     """
 
     factors: Ints  # [R] given cluster sizes, followed by added powers of two
     spans: Ints  # [R] number of samples that are used at each cluster size
     order: Ints  # [R] indices of the cluster sizes, ascending in each grid
     first: Ints  # [R] position of the first cluster size of the same grid
-    weights: Floats  # [R, R] lower triangular matrix, zero outside the grids
+    weights: Floats  # [R, R] upper triangular matrix, zero outside the grids
 
 
 @inlined
@@ -75,7 +75,7 @@ def variance_within_clusters(factors: Ints, spans: Ints) -> VarianceWithinCluste
     >>> v = variance_within_clusters(np.array([1, 2, 4, 3]), np.full(4, 90))
     >>> v.factors.tolist(), v.order.tolist()
     ([1, 2, 4, 3, 1, 2], [0, 1, 2, 4, 5, 3])
-    >>> (v.weights @ (1.0 / v.factors[v.order])).round(12).tolist()  # white noise
+    >>> ((1.0 / v.factors[v.order]) @ v.weights).round(12).tolist()  # white noise
     [0.0, 1.0, 1.0, 0.0, 1.0, 1.0]
     """
     edges = [0, *(np.flatnonzero(np.diff(factors) <= 0) + 1).tolist(), factors.size]
@@ -107,7 +107,7 @@ def _weights_of_grid(m: Floats) -> Floats:
     allan = np.stack([np.interp(log_octaves, log_m, m * one) for one in np.eye(m.size)], axis=1) / octaves[:, None]
     below = 0.5 * (np.cumsum(allan, axis=0) - allan)  # sum over the shorter octaves
     within = below * (octaves / np.maximum(octaves - 1.0, 1.0))[:, None]
-    return np.stack([np.interp(log_m, log_octaves, column) for column in within.T], axis=1)
+    return np.stack([np.interp(log_m, log_octaves, column) for column in within.T])
 
 
 @compiled
@@ -123,27 +123,36 @@ def subtract_excess(
     factors, order, first, weights
         Fields of ``VarianceWithinClusters``.
     share : ndarray of float64, shape (R,)
-        The factor e, times the cluster size.
+        The factor e.
     avar : ndarray of float64, shape (R,)
         On input, half the mean square of the differences; NaN if no difference counts. On output, Allan variance.
     excess : ndarray of float64, shape (R,)
         Output array for the subtracted contribution.
     """
-    level = np.empty(order.size)
+    within, known = np.zeros(order.size), 0.0
     for p in range(order.size):
-        i, within = order[p], 0.0
-        for q in range(first[p], p):
-            within += weights[p, q] * level[q]
-        e = share[i] / factors[i]
-        corrected = (avar[i] - e * within) / (1.0 + e * weights[p, p]) if e != 0.0 else avar[i]
-        excess[i] = avar[i] - corrected if avar[i] == avar[i] else 0.0
-        avar[i] = level[p] = corrected
-        if level[p] == level[p]:
-            continue
-        if p > first[p]:
-            level[p] = level[p - 1] * factors[order[p - 1]] / factors[i]
-            continue
-        for q in range(p + 1, order.size):
-            if first[q] == p and avar[order[q]] == avar[order[q]]:
-                level[p] = avar[order[q]] * factors[order[q]] / factors[i]
-                break
+        i = order[p]
+        raw, corrected = avar[i], avar[i]
+        if raw == raw:
+            if share[i] != 0.0:
+                corrected -= share[i] * within[p]
+                if weights[p, p] != 0.0:
+                    corrected /= 1.0 + share[i] * weights[p, p]
+            known = corrected
+        elif p > first[p]:
+            known *= factors[order[p - 1]] / factors[i]
+        else:
+            known = _white_noise_level(factors, order, first, avar, p)
+        excess[i], avar[i] = (raw - corrected if raw == raw else 0.0), corrected
+        if known == known:
+            for r in range(p, order.size):
+                within[r] += weights[p, r] * known
+
+
+@compiled
+def _white_noise_level(factors: Ints, order: Ints, first: Ints, avar: Floats, p: int) -> float:
+    """Return the Allan variance at position p that white noise would have, from the next known value of the grid."""
+    for q in range(p + 1, order.size):
+        if first[q] == p and avar[order[q]] == avar[order[q]]:
+            return float(avar[order[q]] * factors[order[q]] / factors[order[p]])
+    return np.nan

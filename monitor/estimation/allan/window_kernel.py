@@ -609,16 +609,19 @@ def compute_variances_of_axis(
     share : ndarray of float64, shape (m,)
         Memory for intermediate results.
     """
-    complete = True
+    # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
+    factors, order, sums, rest, terms, extra = w.factors, w.order, w.sums, w.rest, w.terms, w.excess
+    taus, scale, complete = factors.size, w.scaling[axis], True
     for p in range(rows):
-        i = w.order[p]
-        at, unit = i * LANES + axis, w.factors[i] * w.scaling[axis]
-        avar[i] = half_mean_square(w.sums[at] + w.rest[at], w.terms[at], w.excess[at], 2.0 * unit * unit)
-        excess[i], share[i] = 0.0, 0.5 * EXCESS_UNIT * w.excess[at] / max(w.terms[at], 1)
-        complete = complete and w.excess[at] == 0
+        i = order[p]
+        at, unit = i * LANES + axis, factors[i] * scale
+        avar[i] = half_mean_square(sums[at] + rest[at], terms[at], extra[at], 2.0 * unit * unit)
+        excess[i] = share[i] = 0.0
+        if extra[at] != 0:
+            share[i] = 0.5 * EXCESS_UNIT * extra[at] / (float(factors[i]) * terms[at])
+            complete = False
     if not complete:
-        taus = w.factors.size
-        subtract_excess(w.factors, w.order[:rows], w.first[:rows], w.weights.reshape(taus, taus), share, avar, excess)
+        subtract_excess(factors, order[:rows], w.first, w.weights.reshape(taus, taus), share, avar, excess)
 
 
 @compiled

@@ -199,6 +199,7 @@ def _follow(
     memory, taus, window = buffers
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
     counters, phase, missing, scaling, terms, slope = w.state, w.phase, w.missing, w.scaling, curves.terms, curves.slope
+    work = np.empty((3, taus))
     grid = int(np.count_nonzero(w.first == 0))  # number of cluster sizes of the fit, and powers of two between them
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
@@ -219,7 +220,7 @@ def _follow(
             )
         _project(w, scale, curves, maps, right)
         if counters[TOTAL] - counters[LAST_MISSING] <= window:
-            _subtract_excess(w, grid, maps, right)
+            _subtract_excess(w, grid, maps, work, right)
         _apply_maps(right, slope, maps, output, valid)
         for axis in range(AXES):
             ages[axis] += 1
@@ -283,9 +284,12 @@ def _project(
 
 
 @compiled
-def _subtract_excess(w: WindowArrays, grid: int, maps: SolutionMaps, right: Floats) -> None:
-    """Subtract the contribution of missing samples to the mean squares from the right-hand sides."""
-    avar, excess, share = np.empty((3, w.factors.size))
+def _subtract_excess(w: WindowArrays, grid: int, maps: SolutionMaps, work: Floats, right: Floats) -> None:
+    """Subtract the contribution of missing samples to the mean squares from the right-hand sides.
+
+    ``work`` [3, m] is memory for intermediate results.
+    """
+    avar, excess, share = work[0], work[1], work[2]
     rows, used = maps.rows, maps.used
     for axis in range(AXES):
         if used[axis, 1] > used[axis, 0]:
