@@ -30,7 +30,9 @@ def test_decoded_payload_is_encoded_to_the_same_bytes(name: str) -> None:
 def test_reconcile_reply_has_the_keys_of_the_report() -> None:
     report = {"schema": "x", "verdict": "agrees", "axes": {"gz": {}}}
     head = ReconcileReply(device="bench-1", t=UNIX_S, samples=7)
-    assert head.encode_report(report, 0, "/reports/a") == read_stored_payload("reconcile")
+    sent = json.loads(head.encode_report(report, 0, "/reports/a", kept_reports=20))
+    stored = json.loads(read_stored_payload("reconcile"))
+    assert list(sent.items()) == [*stored.items(), ("kept_reports", 20)]
 
 
 def test_every_stored_payload_is_compared() -> None:

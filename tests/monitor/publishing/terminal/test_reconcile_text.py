@@ -40,7 +40,7 @@ def test_summary_and_each_finding_with_parameters_are_printed_without_details() 
         "● explained The model differs from the recording on gz, and 2 findings explain all of the difference. "
         "Line at 17.3 Hz on gz (96 %) and 1 smaller finding (4.3 %). "
         "Continue with model.toml, which contains the findings, if the findings belong to the sensor. "
-        "96 % added line at 17.3 Hz on gz: amplitude 30.94 ± 0.54 °/h, frequency 17.300012 ± 0.000100 Hz "
+        "96 % added line at 17.3 Hz on gz: frequency 17.300012 ± 0.000100 Hz, amplitude 30.94 ± 0.54 °/h "
         "4.3 % white noise N changed by a factor of 1.2 on gz: N 0.6188 ± 0.0014 °/√h "
         "360000 samples at 100 Hz, 1 h 00 min note: 12 missing samples <in 1 gap> & filled"
     )
