@@ -1,11 +1,9 @@
 """Identification of the wire format in captured bytes.
 
-Every decoder of byte streams is tried. The decoder that finds the most samples identifies the format. Lines of numbers,
-which the decoder ``text`` reads, are identified by their number of fields.
+Every decoder of byte streams is tried. The decoder that finds the most samples identifies the format. If none finds
+samples, the layout of text lines is identified for the decoder ``text``.
 """
 
-import re
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -17,8 +15,8 @@ import numpy as np
 from drivers import decoders
 from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.base import Decoder
-from drivers.decoders.text_lines.text.settings import COLUMNS as TEXT_COLUMNS
 from drivers.errors import ConfigError
+from drivers.text_layout_identification import decode_readable_lines, identify_text_layout
 from drivers.validation import module_lookup
 from drivers.validation.settings_model import SettingsModel
 
@@ -27,12 +25,7 @@ MIN_SAMPLES: Final = 5
 
 Even for a format with an 8-bit checksum, random bytes look like two consecutive samples less than once in 10⁹ bytes.
 """
-MIN_TEXT_COLUMNS: Final = 3
-MIN_MATCHING_LINES: Final = 0.9
-"""Minimum fraction of lines that must have the most common number of fields."""
 TEXT_DECODER: Final = "text"
-NMEA_SENTENCE: Final = re.compile(r"\$(.*)\*[0-9A-Fa-f]{2}")
-DELIMITERS: Final = (",", ";", "\t", " ")
 UNKNOWN: Final = "?"
 """Placeholder for an option that cannot be determined from the bytes, such as the sensor model."""
 
@@ -46,7 +39,7 @@ class IdentifiedFormat:
     samples: int = 0  # number of decoded samples, or of text lines
     bad: int = 0  # number of rejected frames
     rate_hz: float | None = None  # sample rate by the device clock; None if the frames contain no clock
-    text_line: str = ""  # example of a text line; "" for other formats
+    text_lines: tuple[str, ...] = ()  # received text; empty for other formats
 
 
 def identify_wire_format(data: bytes) -> IdentifiedFormat | None:
@@ -131,30 +124,6 @@ def _measure_rate_hz(decoder: Decoder, blocks: list[SampleBlock]) -> float | Non
 
 
 def _identify_text_lines(data: bytes) -> IdentifiedFormat | None:
-    # the first and the last line may be incomplete
-    lines = [line.strip() for line in data.split(b"\n")[1:-1]]
-    texts = [line.decode("ascii") for line in lines if line and line.isascii()]
-    for delimiter in DELIMITERS:
-        layouts = Counter(_read_labels(text, delimiter) for text in texts)
-        labels, matching = layouts.most_common(1)[0] if layouts else ((), 0)
-        if len(labels) >= MIN_TEXT_COLUMNS and matching >= max(MIN_SAMPLES, MIN_MATCHING_LINES * len(lines)):
-            example = next(text for text in texts if _read_labels(text, delimiter) == labels)
-            columns = [label if label in TEXT_COLUMNS else UNKNOWN for label in labels]
-            nmea = {"nmea": True} if NMEA_SENTENCE.fullmatch(example) else {}
-            return IdentifiedFormat(TEXT_DECODER, {"columns": columns, **nmea}, matching, text_line=example)
-    return None
-
-
-def _read_labels(text: str, delimiter: str) -> tuple[str, ...]:
-    """Return the label of each number in a line, "" for a number without a label, or () if a field is not a number."""
-    sentence = NMEA_SENTENCE.fullmatch(text)
-    fields = (sentence[1] if sentence else text).split(None if delimiter == " " else delimiter)
-    labels = []
-    for one in fields:
-        label, _, number = one.rpartition(":")
-        try:
-            float(number)
-        except ValueError:
-            return ()
-        labels.append(label.strip())
-    return tuple(labels)
+    lines = decode_readable_lines(data)[1:-1]  # the first and the last line may be incomplete
+    options, matching = identify_text_layout(lines)
+    return IdentifiedFormat(TEXT_DECODER, options, matching, text_lines=tuple(lines)) if options else None

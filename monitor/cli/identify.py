@@ -24,7 +24,9 @@ def identify(
         found = identification.identify_file(Path(source))
     else:
         found = identification.identify_port(source, seconds, lambda line: typer.echo(line, err=True))
-    typer.echo(f"{_describe(found.format.samples, found.format.bad, found.format.rate_hz)}", err=True)
+    for line in identification.show_text(found.format.text_lines):
+        typer.echo(f"received: {line}", err=True)
+    typer.echo(_describe(found.format.samples, found.format.bad, found.format.rate_hz), err=True)
     typer.echo(identification.write_configuration(found), nl=False)
 
 

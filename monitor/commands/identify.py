@@ -1,6 +1,7 @@
 """Identification of the wire format on a serial port or in a file of captured bytes."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -8,9 +9,11 @@ from typing import Final
 
 import msgspec
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, NotReady
 from drivers.host import safe_file_reading
 from drivers.links import serial_link
+from drivers.text_layout_identification import decode_readable_lines
 from drivers.validation.settings_model import check_table
 from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
 
@@ -18,6 +21,12 @@ BAUD_RATES: Final = (115200, 460800, 921600, 230400, 9600, 57600, 38400, 19200, 
 """Baud rates of IMUs in bit/s, the most common first."""
 MAX_BYTES: Final = 16384
 """Number of bytes that are examined, which is 0.2 s at the highest baud rate."""
+MAX_SHOWN_LINES: Final = 5
+MAX_SHOWN_CHARACTERS: Final = 200
+GYRO_UNITS: Final = ("rad/s", "deg/s", "mdps", "deg/s/131")
+ACCEL_UNITS: Final = ("m/s²", "g", "mg", "g/16384")
+USUAL_GYRO_UNITS: Final = {"g": "deg/s", "mg": "deg/s", "g/16384": "deg/s/131"}
+"""Unit of the gyroscope that boards usually send together with a unit of the accelerometer, if not rad/s."""
 NO_BYTES_ADVICE: Final = (
     "check the power and the wiring of TX and RX; a sensor that only answers requests, such as a BNO055, "
     "cannot be identified"
@@ -45,7 +54,8 @@ def identify_file(path: Path) -> IdentifiedSource:
         data = file.read(MAX_BYTES)
     found = identify_wire_format(data)
     if found is None:
-        raise NotReady(f"{path}: no decoder finds samples in the first {len(data)} bytes")
+        text = _quote_text(decode_readable_lines(data))
+        raise NotReady(f"{path}: no decoder finds samples in the first {len(data)} bytes{text}")
     return IdentifiedSource(str(path), found)
 
 
@@ -84,10 +94,27 @@ def identify_port(port: str, listen_s: float, report: Callable[[str], None]) -> 
         if found is not None:
             rate_hz = found.rate_hz or (found.samples / seconds if seconds > 0.0 else None)
             return IdentifiedSource(port, replace(found, rate_hz=rate_hz), baudrate)
+        if text := _quote_text(decode_readable_lines(data)):
+            raise NotReady(f"{port}: {baudrate} baud: no decoder finds samples in {len(data)} bytes{text}")
         report(f"{baudrate} baud: {len(data)} bytes, no known format")
     if not received:
         raise NotReady(f"{port}: no bytes at any baud rate; {NO_BYTES_ADVICE}")
     raise NotReady(f"{port}: no decoder finds samples at any baud rate; try a longer time with --seconds")
+
+
+def _quote_text(lines: Sequence[str]) -> str:
+    """Return the end of a message about readable text without a known layout; "" if there are no lines."""
+    quoted = ", ".join(map(_to_toml, show_text(lines)))
+    advice = "print all axes of a sample in one line, with the same text between the numbers"
+    return f", but the text is readable: {quoted}; {advice}" if lines else ""
+
+
+def show_text(lines: Sequence[str]) -> list[str]:
+    """Return the first lines of received text, shortened and with escaped control characters."""
+    return [
+        "".join(one if one.isprintable() else repr(one)[1:-1] for one in line[:MAX_SHOWN_CHARACTERS])
+        for line in lines[:MAX_SHOWN_LINES]
+    ]
 
 
 def _listen(port: str, baudrate: int, listen_s: float) -> tuple[bytes, float]:
@@ -127,17 +154,22 @@ def write_configuration(found: IdentifiedSource) -> str:
     lines.append(f'decoder = "{found.format.decoder}"')
     if found.format.options:
         lines += ["", "[device.driver.decoder_options]"]
+    options = dict(found.format.options)
     if found.format.decoder == TEXT_DECODER:
-        lines.append(f"# one line of the sensor: {found.format.text_line}")
-        lines.append('# replace each "?" by gx gy gz ax ay az temperature t counter, or "-" to skip the column')
-    elif UNKNOWN in found.format.options.values():
+        lines += [f"# {line}" for line in ("received text:", *show_text(found.format.text_lines))]
+        lines.append("# the columns are guessed from labels and gravity; turn the sensor to check axes and units")
+    elif UNKNOWN in options.values():
         lines.append('# replace "?"; imu-monitor check names the possible values')
-    lines += [f"{key} = {_to_toml(value)}" for key, value in found.format.options.items()]
+    lines += [f"{key} = {_to_toml(value)}" for key, value in options.items()]
     if found.format.decoder == TEXT_DECODER:
-        lines.append(
-            "# the units cannot be identified; the board may send deg/s and g, or raw counts (key preset or scale)"
-        )
-        lines += ['gyro_unit = "rad/s"', 'accel_unit = "m/s²"']
+        columns = options.get("columns") or re.findall(r"\(\?P<(\w+)>", options["pattern"])
+        usual = {"accel_unit": "m/s²", "gyro_unit": USUAL_GYRO_UNITS.get(options.get("accel_unit", ""), "rad/s")}
+        for key, choices in (("gyro_unit", GYRO_UNITS), ("accel_unit", ACCEL_UNITS)):
+            if key not in options and any(name[0] == key[0] for name in columns if name in AXES):
+                listed = ", ".join(map(_to_toml, choices))
+                lines.append(
+                    f"{key} = {_to_toml(usual[key])}  # CHOOSE the unit, which the text does not show: {listed}, …"
+                )
     return "\n".join(lines) + "\n"
 
 

@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.data_types import NO_TICK, CounterTimedFormat, make_block
+from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, Floats, make_block
+from drivers.decoders.text_lines import text
+from drivers.text_layout_identification import decode_readable_lines
+from drivers.validation.settings_model import check_table
 from drivers.wire_format_identification import MIN_SAMPLES, TEXT_DECODER, identify_wire_format
 from tests.contracts.decoder_examples import EXAMPLES, Example
 
@@ -83,19 +86,75 @@ def test_noise_is_not_identified(captures: int) -> None:
         assert identify_wire_format(data) is None
 
 
-@pytest.mark.parametrize(("line", "columns"), [("0.01,-0.02, 9.81", 3), ("1\t2\t3\t4\t5\t6", 6), ("17 1e-3 2 nan", 4)])
-def test_lines_of_numbers_are_identified_as_text(line: str, columns: int) -> None:
-    found = identify_wire_format((line + "\r\n").encode() * 20)
+ISSUE_LINE = "A:{0:.3f},{1:.3f},{2:.3f} G:{3:.3f},{4:.3f},{5:.3f} T:{6:.1f}"
+TEXT_LINES = [  # layout, gravity, columns in the order of the layout, options
+    (ISSUE_LINE, 9.81, {"accel_unit": "m/s²"}),
+    (ISSUE_LINE + "°C", 1.0, {"accel_unit": "g"}),
+    ("t:{7} acc: {0:.3f} {1:.3f} {2:.3f} gyro: {3:.3f} {4:.3f} {5:.3f} temp: {6:.1f}", 1.0, {"accel_unit": "g"}),
+    ("T={6:.1f};a={0:.3f},{1:.3f},{2:.3f};g={3:.3f},{4:.3f},{5:.3f};mag=7.0,8.0,9.0", 1000.0, {"accel_unit": "mg"}),
+    ("AcX = {0:.0f} | AcY = {1:.0f} | AcZ = {2:.0f} | Tmp = {6:.2f} | GyX = {3:.2f} | GyY = {4:.2f} | GyZ = {5:.2f}",
+     16384.0, {"accel_unit": "g/16384"}),
+    ("Acceleration X: {0:.3f}, Y: {1:.3f}, Z: {2:.3f} m/s^2 Rotation X: {3:.3f}, Y: {4:.3f}, Z: {5:.3f} rad/s "
+     "Temperature: {6:.1f} degC", 9.81, {"accel_unit": "m/s²", "gyro_unit": "rad/s"}),
+    ('{{"acc":[{0:.3f}, {1:.3f}, {2:.3f}], "gyr":[{3:.3f}, {4:.3f}, {5:.3f}], "temp": {6:.1f}}}', 9.81, {}),
+    ("G {3:.3f}dps {4:.3f}dps {5:.3f}dps A {0:.3f}g {1:.3f}g {2:.3f}g T {6:.1f}", 1.0, {"gyro_unit": "dps"}),
+    ("A:{0:8.3f},{1:8.3f},{2:8.3f}  G:{3:8.3f},{4:8.3f},{5:8.3f} T:{6:.1f}", 9.81, {}),
+    ("12:30:15 -> acc=({0:.3f}, {1:.3f}, {2:.3f}) gyro=({3:.3f}, {4:.3f}, {5:.3f}) temp={6:.1f}", 9.81, {}),
+    ("accX:{0:.3f},accY:{1:.3f},accZ:{2:.3f},gyroX:{3:.3f},gyroY:{4:.3f},gyroZ:{5:.3f},temp:{6:.1f}", 9.81, {}),
+]  # fmt: skip
+
+
+def write_text_lines(layout: str, gravity: float) -> tuple[bytes, Floats]:
+    """Return 40 lines of a sensor at rest, and the numbers ax ay az gx gy gz temperature in these lines."""
+    rng = np.random.default_rng(3)
+    accel = rng.normal((0.1, -0.2, 0.97), 0.005, (40, 3)) * gravity
+    table = np.column_stack([accel, rng.normal(0.0, 0.05, (40, 3)), rng.normal(25.0, 0.3, 40)])
+    lines = [layout.format(*row, 1000 + 10 * i) + "\r\n" for i, row in enumerate(table.tolist())]
+    return "".join(lines).encode(), table
+
+
+@pytest.mark.parametrize(("layout", "gravity", "options"), TEXT_LINES)
+def test_identified_text_lines_are_decoded_with_the_right_axes(
+    layout: str, gravity: float, options: dict[str, str]
+) -> None:
+    data, table = write_text_lines(layout, gravity)
+    found = identify_wire_format(data)
     assert found is not None
-    assert (found.decoder, found.options, found.text_line) == (TEXT_DECODER, {"columns": ["?"] * columns}, line)
+    assert found.decoder == TEXT_DECODER
+    assert {key: found.options[key] for key in options} == options
+    si = {"gyro_unit": "rad/s", "accel_unit": "m/s²/1000"}
+    decoder = text.build(check_table(text.Settings, {**found.options, **si}).value)
+    (block,) = decoder.feed([Chunk(data, 0)])
+    assert (len(block), decoder.bad) == (39, 0)
+    np.testing.assert_allclose(block.values[:, :3], table[1:, 3:6], atol=0.006)
+    np.testing.assert_allclose(1000.0 * block.values[:, 3:], table[1:, :3], atol=0.51 if gravity > 2000.0 else 0.001)
+    np.testing.assert_allclose(block.temperature_c, table[1:, 6], atol=0.051)
 
 
-def test_labels_of_text_lines_name_the_columns() -> None:
-    found = identify_wire_format(b"gx:0.01,gy:-0.02,az:9.81,light:3\r\n" * 20)
+@pytest.mark.parametrize(
+    ("layout", "gravity", "columns"),
+    [
+        ("{3:.3f},{4:.3f},{5:.3f},{0:.3f},{1:.3f},{2:.3f}", 9.81, "gx gy gz ax ay az"),
+        ("{7} {0:.3f} {1:.3f} {2:.3f} {3:.3f} {4:.3f} {5:.3f}", 1.0, "t ax ay az gx gy gz"),
+        ("{0:.0f}\t{1:.0f}\t{2:.0f}\t{6:.2f}\t{3:.0f}\t{4:.0f}\t{5:.0f}", 16384.0, "ax ay az - gx gy gz"),
+        ("{0:.3f}; {1:.3f}; {2:.3f}", 9.81, "ax ay az"),
+        ("{3:.3f},{4:.3f},{5:.3f}", 9.81, "gx gy gz"),
+        ("gx:{3:.3f},gy:{4:.3f},az:{2:.3f},light:3", 9.81, "gx gy az -"),
+    ],
+)
+def test_columns_of_numbers_are_named_by_labels_or_gravity(layout: str, gravity: float, columns: str) -> None:
+    found = identify_wire_format(write_text_lines(layout, gravity)[0])
     assert found is not None
-    assert (found.decoder, found.options) == (TEXT_DECODER, {"columns": ["gx", "gy", "az", "?"]})
+    assert (found.decoder, found.options["columns"]) == (TEXT_DECODER, columns.split())
 
 
-@pytest.mark.parametrize("text", ["starting\nready\n" * 20, "1,2\n" * 20, "1,2,3\n" * MIN_SAMPLES])
-def test_other_text_is_not_identified(text: str) -> None:
-    assert identify_wire_format(text.encode()) is None
+def test_text_at_a_wrong_baud_rate_is_not_readable() -> None:
+    data, _ = write_text_lines(ISSUE_LINE, 9.81)
+    assert decode_readable_lines(data)
+    for ratio in WRONG_BAUD_RATIOS:
+        assert decode_readable_lines(read_at_wrong_baud_rate(data, ratio)) == []
+
+
+@pytest.mark.parametrize("captured", ["starting\nready\n" * 20, "1,2\n" * 20, "1,2,3\n" * MIN_SAMPLES])
+def test_other_text_is_not_identified(captured: str) -> None:
+    assert identify_wire_format(captured.encode()) is None

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from drivers.data_types import Chunk
 from drivers.decoders.binary_frames.stim300 import Stim300Decoder
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
 from monitor.cli import app
 from monitor.commands import identify
 from monitor.settings.loading import load_config
 from tests.contracts.decoder_examples import EPSON, STIM300, TEXT, Example
-from tests.drivers.test_wire_format_identification import encode_capture
+from tests.drivers.test_wire_format_identification import ISSUE_LINE, encode_capture, write_text_lines
 
 
 @contextmanager
@@ -92,8 +93,7 @@ def test_command_prints_the_configuration_of_a_capture(example: Example, tmp_pat
     assert result.exit_code == 0
     assert f'decoder = "{example.name}"' in result.stdout
     assert "found " in result.stderr
-    assert ('columns = ["?","?"' in result.stdout) == (example.name == "text")
-    assert ('gyro_unit = "rad/s"' in result.stdout) == (example.name == "text")
+    assert ('gyro_unit = "rad/s"  # CHOOSE' in result.stdout) == (example.name == "text")
     assert ('model = "?"' in result.stdout) == (example.name == "epson_uart")
 
 
@@ -102,3 +102,29 @@ def test_file_without_samples_is_not_identified(tmp_path: Path) -> None:
     path.write_bytes(b"booting\n" * 100)
     with pytest.raises(NotReady, match="no decoder finds samples in the first 800 bytes"):
         identify.identify_file(path)
+
+
+def test_labelled_text_on_a_port_gives_a_configuration_that_works_when_copied(tmp_path: Path) -> None:
+    data, _ = write_text_lines(ISSUE_LINE, 1.0)
+    with open_sending_terminal(data) as port:
+        result = CliRunner().invoke(app, ["identify", port])
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count(" baud: ") == 0  # no other baud rate was tried
+    assert "received: A:0." in result.stderr
+    assert 'gyro_unit = "deg/s"  # CHOOSE the unit' in result.stdout
+    path = tmp_path / "bench.toml"
+    path.write_text(result.stdout)
+    (device,) = load_config(path).devices
+    (block,) = device.driver.decoder.feed([Chunk(data, 0)])
+    assert len(block) == 39
+    assert np.linalg.norm(block.values[:, 3:], axis=1) == pytest.approx(9.81, rel=0.05)
+
+
+def test_readable_text_without_a_layout_is_shown_and_ends_the_search() -> None:
+    lines: list[str] = []
+    with (
+        open_sending_terminal(b"waiting\x1b[0m for the sensor\r\n") as port,
+        pytest.raises(NotReady, match=r"115200 baud: .* the text is readable: .*waiting\\\\x1b\[0m for the sensor"),
+    ):
+        identify.identify_port(port, 0.5, lines.append)
+    assert lines == []
