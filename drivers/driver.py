@@ -137,7 +137,8 @@ class Driver:
         self._silence_s = silence_s
         self._events: deque[Event] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._stop = threading.Event()
-        self._undecoded_bytes = 0
+        self._undecoded_bytes = self._undecoded_bad = 0
+        self._undecoded_since = ""  # local time of day of the first byte without a sample
         self._undecoded_capture = b""  # first bytes of a device whose bytes cannot be decoded
         self._format_hint = ""
         self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
@@ -314,6 +315,8 @@ class Driver:
 
     def _check_undecoded(self, data: bytes) -> None:
         """Report a device whose bytes cannot be decoded."""
+        if not self._undecoded_bytes:
+            self._undecoded_bad, self._undecoded_since = self.counts.bad, time.strftime("%H:%M:%S")
         self._count_decoder_drops()
         self._undecoded_bytes += len(data)
         mute_s = self._last_data_s - self._last_sample_s
@@ -322,7 +325,11 @@ class Driver:
             return
         why = self.decoder.recent_problem or "wrong baud rate, or another protocol than the configured one"
         self._identify_undecoded(data)
-        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes without a sample; {why}{self._format_hint}"
+        bad = self.counts.bad - self._undecoded_bad
+        rejected = f", {bad} lines or frames rejected since {self._undecoded_since}" if bad else ""
+        self.text = (
+            f"{self.link.name}: {self._undecoded_bytes} bytes without a sample{rejected}; {why}{self._format_hint}"
+        )
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"

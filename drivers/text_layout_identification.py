@@ -123,10 +123,10 @@ def _name_columns(labels: Sequence[str], table: Floats) -> list[str]:
         Numbers, shape [lines, n].
     """
     steps = np.diff(table, axis=0)
-    increases = (steps > 0.0).all(axis=0)
+    increases = np.all(steps > 0.0, axis=0)
     columns: list[str] = []
     kind, used = SKIP, 3  # the last label of a kind, and how many numbers belong to it
-    for label, increasing in zip(labels, increases, strict=True):
+    for label, increasing in zip(labels, increases.tolist(), strict=True):
         name = SKIP
         for word in _list_label_words(label, within_group=0 < used < 3):
             named = AXIS_LABEL.fullmatch(word)
@@ -144,7 +144,7 @@ def _name_columns(labels: Sequence[str], table: Floats) -> list[str]:
     columns = [SKIP if name in columns[:i] else name for i, name in enumerate(columns)]
     if not set(columns) & set(AXES):
         columns = _assign_axes_by_size(columns, table)
-    is_clock = {"t": increases, "counter": (steps == 1.0).all(axis=0) & ("t" not in columns)}
+    is_clock = {"t": increases, "counter": np.all(steps == 1.0, axis=0) & ("t" not in columns)}
     return [SKIP if name in is_clock and not is_clock[name][i] else name for i, name in enumerate(columns)]
 
 

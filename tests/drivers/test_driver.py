@@ -5,6 +5,7 @@ Most of them use the in-memory loopback link.
 
 import itertools
 import os
+import re
 import threading
 import time
 from contextlib import contextmanager
@@ -386,6 +387,14 @@ def test_status_names_the_options_that_fit_undecoded_bytes(configured, sent, hin
         for chunk in encoder.encode(make_samples(0, 200, tick_s=1.0, modulus=256)):
             rig.link.write(chunk.data)
         rig.wait_until(lambda: hint in rig.driver.text)
+
+
+def test_status_counts_the_rejected_lines_and_names_the_pattern_that_fits():
+    with run_driver(text.build(text.Settings(columns=["gx", "gy", "gz", "ax", "ay", "az", "temperature"]))) as rig:
+        for i in range(200):
+            rig.link.write(b"A:0.1,0.2,9.8 G:0.01,0.02,0.0%d T:25.%d\n" % (i % 7, i % 10))
+        rig.wait_until(lambda: "(?P<ax>" in rig.driver.text)
+        assert re.search(r"\d+ lines or frames rejected since \d\d:\d\d:\d\d; a line has 5 columns", rig.driver.text)
 
 
 def test_times_are_unix_if_the_link_has_unix_times():
