@@ -340,8 +340,12 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
-        if problems := one.describe_device_problems():
-            state = one.state(now_s)
+        state, problems = one.state(now_s), one.describe_device_problems()
+        if one.sends_nothing(now_s):
+            since = _local_time(time.time() - (now_s - one.last_message_s))
+            what = "the daemon has ended or cannot be reached" if state == "gone" else "no messages"
+            problems = "; ".join(filter(None, [f"{what} since {since}", problems]))
+        if problems:
             symbol, colour = RUNNING_PROBLEM_STYLE if state == "running" else STATES.get(state, UNKNOWN_STATE_STYLE)
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))
     if len(lines) > MAX_PROBLEM_LINES:

@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from dataclasses import replace
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -285,6 +286,21 @@ def test_removed_device_is_marked_as_gone(registry: RemoteDeviceRegistry, clock:
     registry.set_liveliness_token("imu/a/alive", True)
     send_status(registry, "a")
     assert find_row(render_table(registry, now_s=NOW_S + 10.5), "a").split()[1:3] == ["●", "running"]
+
+
+@pytest.mark.parametrize("token_exists", [True, False])
+def test_device_whose_daemon_has_ended_keeps_its_row_with_the_time(
+    registry: RemoteDeviceRegistry, token_exists: bool
+) -> None:
+    for device in ("a", "b"):
+        send_status(registry, device)
+    registry.set_liveliness_token(topics.ALIVE.key("imu", "a"), token_exists)
+    newest = datetime.now().astimezone()
+    text = render_table(registry, now_s=NOW_S + 7200.0)
+    assert find_row(text, "a")
+    what = "no messages since" if token_exists else "the daemon has ended or cannot be reached since"
+    times = [f"{newest - timedelta(hours=2, seconds=late):%H:%M:%S}" for late in range(-60, 2)]
+    assert re.search(rf"a  {what} ({'|'.join(times)})\n", text)
 
 
 def test_device_without_messages_is_shown_as_present(registry: RemoteDeviceRegistry) -> None:
