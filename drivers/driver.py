@@ -22,9 +22,7 @@ from drivers.data_types import AXES, NS_PER_S, Chunk, Event, SampleBlock, Sender
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import DropCountingLink, Link
-from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
-from drivers.wire_format_identification import identify_wire_format
 
 READ_TIMEOUT_S: Final = 0.2
 """Longest time in s that one read waits for the first byte."""
@@ -178,6 +176,8 @@ class Driver:
             except Exception as error:  # noqa: BLE001 - the status of the device shows the bug
                 self.unexpected_error = error
                 text = f"the reader failed because of a bug in the program: {error!r}"
+            from drivers.links.replay_link import ReplayLink  # slow to import, because it imports all file formats
+
             if isinstance(self.link, ReplayLink):  # the link would begin again with the first sample
                 self.state, self.text = "ended", text
                 return None
@@ -343,6 +343,8 @@ class Driver:
         self._undecoded_capture += data[:missing]
         if len(data) < missing:
             return
+        from drivers.wire_format_identification import identify_wire_format
+
         found = identify_wire_format(self._undecoded_capture)
         if found is None:
             return

@@ -9,7 +9,6 @@ from typing import Final
 
 from drivers.host import safe_file_reading
 from drivers.host.extras import install_command
-from drivers.links.replay_link import ReplayLink
 from drivers.validation.number_ranges import DAY_S
 from monitor.commands.doctor.finding import DoctorFinding, doubt, user_name, well, wrong
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, describe_lock_holder
@@ -73,6 +72,8 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     own = config.storage
     if own is None:
         return 0.0
+    from drivers.links.replay_link import ReplayLink  # slow to import, because it imports all file formats
+
     each = SAMPLE_BYTES * own.record + RAW_BYTES * own.raw
     rates = [one.rate_hz for one in config.devices if not isinstance(one.link, ReplayLink)]  # replays are not recorded
     known = [rate for rate in rates if rate is not None]
