@@ -23,6 +23,8 @@ MIN_MATCHING_LINES: Final = 0.9
 """Minimum fraction of lines that must have the most common layout."""
 MIN_PRINTABLE: Final = 0.97
 """Minimum fraction of printable characters in readable text. Text at a wrong baud rate has far fewer."""
+MIN_TEXT_CHARACTERS: Final = 30
+"""Minimum length of readable text. Shorter noise could consist of printable characters by chance."""
 NUMBER: Final = re.compile(r"(?:(?<![\w.)\]])[-+])?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|\bnan\b")
 NUMBER_IN_PATTERN: Final = "[-+.0-9eE]+"
 NMEA_SENTENCE: Final = re.compile(r"\$(.*)\*[0-9A-Fa-f]{2}")
@@ -50,7 +52,8 @@ def decode_readable_lines(data: bytes) -> list[str]:
     text = data.decode("utf-8", "replace")
     printable = sum(one in "\r\n\t\b\x1b" or (one.isprintable() and one != "\N{REPLACEMENT CHARACTER}") for one in text)
     lines = [line.strip() for line in data.decode("ascii", "replace").replace("\r", "\n").split("\n")]
-    return [line for line in lines if line] if len(lines) > 1 and printable >= MIN_PRINTABLE * len(text) else []
+    readable = len(text) >= MIN_TEXT_CHARACTERS and len(lines) > 1 and printable >= MIN_PRINTABLE * len(text)
+    return [line for line in lines if line] if readable else []
 
 
 def identify_text_layout(lines: Sequence[str]) -> tuple[dict[str, Any], int]:

@@ -13,7 +13,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, NotReady
 from drivers.host import safe_file_reading
 from drivers.links import serial_link
-from drivers.text_layout_identification import decode_readable_lines
+from drivers.text_layout_identification import MIN_LINES, decode_readable_lines
 from drivers.validation.settings_model import check_table
 from drivers.wire_format_identification import TEXT_DECODER, UNKNOWN, IdentifiedFormat, identify_wire_format
 
@@ -106,6 +106,8 @@ def _quote_text(lines: Sequence[str]) -> str:
     """Return the end of a message about readable text without a known layout; "" if there are no lines."""
     quoted = ", ".join(map(_to_toml, show_text(lines)))
     advice = "print all axes of a sample in one line, with the same text between the numbers"
+    if len(lines) < MIN_LINES + 2:  # the first and the last line are not examined
+        advice = f"at least {MIN_LINES + 2} lines are needed; try a longer time with --seconds"
     return f", but the text is readable: {quoted}; {advice}" if lines else ""
 
 

@@ -128,3 +128,10 @@ def test_readable_text_without_a_layout_is_shown_and_ends_the_search() -> None:
     ):
         identify.identify_port(port, 0.5, lines.append)
     assert lines == []
+
+
+def test_too_few_lines_of_text_ask_for_a_longer_time(tmp_path: Path) -> None:
+    path = tmp_path / "capture.txt"
+    path.write_bytes(b"".join(write_text_lines(ISSUE_LINE, 9.81)[0].splitlines(keepends=True)[:5]))
+    with pytest.raises(NotReady, match="at least 7 lines are needed; try a longer time with --seconds"):
+        identify.identify_file(path)
