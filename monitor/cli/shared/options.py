@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, overload
 
 import typer
 
+from drivers import units
 from drivers.errors import ConfigError, make_printable_and_shorten
 from drivers.validation.number_ranges import (
     DURATION_S,
@@ -159,10 +160,15 @@ READING_OPTIONS = {
     "columns": _text_option(
         "Q=COLUMN,…", "Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name."
     ),
-    "gyro_unit": _text_option("UNIT", "Unit of gx, gy, gz in the file: deg/s, deg/s/131, mrad/s, …"),
-    "accel_unit": _text_option("UNIT", "Unit of ax, ay, az in the file: g, mg, g/16384, …"),
-    "temperature_unit": _text_option("UNIT", "Unit of the temperature in the file: °C, K or °F."),
-    "time_unit": _text_option("UNIT", "Unit of the times in the file: s, ms, us or ns."),
+    "gyro_unit": _text_option(
+        "UNIT", f"Unit of gx, gy, gz in the file: {', '.join(units.RATE)}, or divided by a sensitivity: deg/s/131."
+    ),
+    "accel_unit": _text_option(
+        "UNIT",
+        f"Unit of ax, ay, az in the file: {', '.join(units.ACCELERATION)}, or divided by a sensitivity: g/16384.",
+    ),
+    "temperature_unit": _text_option("UNIT", f"Unit of the temperature in the file: {', '.join(units.TEMPERATURE)}."),
+    "time_unit": _text_option("UNIT", f"Unit of the times in the file: {', '.join(units.TIME)}."),
 }
 """Options that determine how a recording is read, by the field of ``ReadingOptions``."""
 DECODER_OPTIONS = {

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -23,9 +23,11 @@ import psutil
 import pytest
 import typer
 
+from drivers import units
 from drivers.data_types import AXES
 from drivers.recordings import save_samples
 from monitor.cli import app, main, report_failed_thread
+from monitor.cli.shared.options import READING_OPTIONS
 from monitor.common import topics
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model_loading import read_model
@@ -930,6 +932,20 @@ def test_help_lists_every_export_format() -> None:
     command = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
     [option] = [parameter for parameter in command.params if "--format" in parameter.opts]
     assert option.help.endswith(f": {', '.join(FORMATS)}.")
+
+
+@pytest.mark.parametrize(
+    ("option", "known"),
+    [
+        ("gyro_unit", units.RATE),
+        ("accel_unit", units.ACCELERATION),
+        ("temperature_unit", units.TEMPERATURE),
+        ("time_unit", units.TIME),
+    ],
+)
+def test_help_lists_every_unit(option: str, known: Mapping[str, object]) -> None:
+    help_text = READING_OPTIONS[option].__metadata__[0].help
+    assert set(known) <= set(re.split(r", |: |\.$", help_text))
 
 
 def test_present_result_of_a_daemon_is_exported(run_program: RunProgram, monkeypatch: pytest.MonkeyPatch) -> None:
