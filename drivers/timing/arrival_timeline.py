@@ -148,17 +148,18 @@ class ArrivalTimeline:
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
             self.find_rate_change(self.index, arrived_s)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
-        period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a rate, only the order is known
+        period_s = self.line.period_s() or 2.0 / NS_PER_S  # without a rate, only the order is known
         # A sample cannot have been taken after it arrived. JUMP_S allows for the jitter of the arrival times.
         newest_s = min(self.line.time_at_index_s(self.index), arrived_s + JUMP_S)
         t_s = newest_s - (self.index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
         t_ns: Ints = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
-        if t_ns[0] <= self.last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
-            # The line has moved backwards, or float64 is too coarse. Keep the sample times increasing.
-            order = np.arange(len(samples))
-            t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self.last_t_ns + 1)) + order
+        if t_ns[0] < self.last_t_ns + 2 or (t_ns[1:] < t_ns[:-1] + 2).any():
+            # The line has moved backwards, or float64 is too coarse. Keep the sample times increasing by at least 2 ns,
+            # so that they also increase after rounding on a clock that is slewed.
+            order = 2 * np.arange(len(samples))
+            t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self.last_t_ns + 2)) + order
         self.last_t_ns = int(t_ns[-1])
         return t_ns
 

@@ -130,7 +130,6 @@ class DeviceWorker:
         self._recorder = recorder
         self._wake = wake
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
-        self._recorded_unix_ns = 0  # time of the last sample that was passed to the recorder
         self._unstarted = [one for one in (simulated, self._thread) if one is not None]
         self._start_estimation(published=0)
 
@@ -394,15 +393,7 @@ class DeviceWorker:
         if self._recorder is not None:
             if self.pipeline.estimator is None:  # the program may crash before the first status is published
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
-            offsets_ns = self.timeline.unix_offsets_ns(samples)
-            if not self.driver.times_are_unix:
-                # A sample may have been ahead of the host clock when the slew of the Unix times changed.
-                unix_ns = samples.t_ns + offsets_ns
-                offsets_ns = offsets_ns + max(self._recorded_unix_ns + 1 - int(unix_ns[0]), 0)
-                self._recorded_unix_ns = max(self._recorded_unix_ns + 1, int(unix_ns[0])) + int(
-                    unix_ns[-1] - unix_ns[0]
-                )
-            self._recorder.queue_samples(self.name, samples, offsets_ns)
+            self._recorder.queue_samples(self.name, samples, self.timeline.unix_offsets_ns(samples))
             while self._replayed and self._recorder.is_queue_filling(self.name):
                 time.sleep(REPLAY_PAUSE_S)
         while self._replayed and self.ring.free_capacity < len(samples) < self.ring.capacity:

@@ -11,6 +11,7 @@ from typing import Final
 
 from drivers.data_types import Event, Ints, SampleBlock
 from drivers.driver import Driver
+from drivers.timing.arrival_timeline import JUMP_S
 from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
 
 MAX_UNTIMED_EVENTS: Final = 100
@@ -119,7 +120,9 @@ class DeviceTimeline:
     def slew_to_host_clock(self) -> None:
         """Slew the Unix times of the samples towards the host clock, and queue an event if the host clock was set."""
         now_ns = time.monotonic_ns()
-        step_s = self._clock.slew_and_return_host_step(now_ns, time.time_ns()) / 1e9
+        # Sample times may be ahead of the host clock. A correction that begins after them leaves them in order.
+        ahead_ns = round(JUMP_S * 1e9)
+        step_s = self._clock.slew_and_return_host_step(now_ns + ahead_ns, time.time_ns() + ahead_ns) / 1e9
         if abs(step_s) < MIN_CLOCK_STEP_S or self._driver.times_are_unix:
             return
         text = (
