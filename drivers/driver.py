@@ -199,7 +199,7 @@ class Driver:
                 if not self.times_are_unix:
                     self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
-                self._last_read_s = _read_suspend_aware_clock_s()
+                self._last_read_s = -inf  # data may have waited in the link before it was opened
                 while not self._stop.is_set():
                     self.read_and_push_once()
             except LinkEnded as error:

@@ -47,7 +47,7 @@ class ArrivalRegression:
         self.has_enough_points_for_gaps = False
         """True if the regression has enough points to distinguish a gap from jitter."""
         self._x0 = self._t0 = 0.0  # index and time of the newest point
-        self._first_x = self._first_t = 0.0
+        self._first_x = self.first_t_s = 0.0
         self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
 
     def add_point(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
@@ -63,7 +63,7 @@ class ArrivalRegression:
             Nominal sample rate in Hz, which is used until there are enough points for an estimate. None if unknown.
         """
         if self.count == 0:
-            self._first_x, self._first_t = index, t_s
+            self._first_x, self.first_t_s = index, t_s
             self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
         dx, dt = index - self._x0, t_s - self._t0
         keep = max(exp(-max(dt, 0.0) / FORGET_S), MIN_FORGETTING_FACTOR) if self.count else 0.0
@@ -82,7 +82,7 @@ class ArrivalRegression:
         self._stt += (1.0 - gain) * et * et
         self.count += 1
         self.has_enough_points_for_gaps = (
-            self._x0 - self._first_x >= MIN_SAMPLES and self._t0 - self._first_t >= MIN_SPAN_S
+            self._x0 - self._first_x >= MIN_SAMPLES and self._t0 - self.first_t_s >= MIN_SPAN_S
         )
 
     def shift_points(self, samples: float) -> None:

@@ -38,6 +38,8 @@ MAX_RATE_HZ: Final = 32_000.0
 """Highest plausible sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
 """Maximum number of consecutive missing samples (116 days at 1 kHz)."""
+UNKNOWN_BACKLOG_NS: Final = 500_000_000
+"""Time in ns after a stall in which samples count as a backlog if no earlier sample shows the rate."""
 BATCH_NS: Final = 100_000_000
 """Duration in ns of the arrivals that become one point of the regression."""
 SINGLE_NS: Final = 2_000_000_000
@@ -140,6 +142,7 @@ class ArrivalTimeline:
         """
         index = self.index + np.cumsum(missing + 1)
         passed = float(index[-1]) - self.index
+        previous_index, previous_ns = self.index, self.arrived_ns
         self.index = float(index[-1])
         self.arrived_ns = int(samples.t_ns[-1])
         arrived_s = self.seconds_since_origin(self.arrived_ns)
@@ -147,6 +150,11 @@ class ArrivalTimeline:
             # The last sample of a chunk has the shortest delay.
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
             self.find_rate_change(self.index, arrived_s)
+        elif self._line_is_backlog:
+            self.restart_line()
+            if previous_ns and not self.nominal_hz:  # the rate between two reads is better than none
+                self.line.add_point(previous_index, self.seconds_since_origin(previous_ns))
+            self.line.add_point(self.index, arrived_s, self.nominal_hz)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
         period_s = self.line.period_s() or 2.0 / NS_PER_S  # without a rate, only the order is known
         # A sample cannot have been taken after it arrived. JUMP_S allows for the jitter of the arrival times.
@@ -199,8 +207,17 @@ class ArrivalTimeline:
         """True unless the newest samples may have waited in a buffer, or samples before them may be missing."""
         return self._delay is None and (self._stall_end_ns is None or self.arrived_ns < self._stall_end_ns)
 
+    @property
+    def _line_is_backlog(self) -> bool:
+        """True if the line gives no period, or consists of samples that may have waited during a stall."""
+        if self._stall_end_ns is None or self._delay is not None:
+            return False
+        return self.line.period_s() is None or self.line.first_t_s >= self.seconds_since_origin(self._stall_end_ns)
+
     def note_stall(self, stall_end_ns: int) -> None:
         """Record that the reader has not run for some time before ``stall_end_ns``, so that unread data have waited."""
+        if self._line_is_backlog:
+            self.restart_line()
         self._stall_end_ns = stall_end_ns
 
     def forget_delay(self) -> None:
@@ -233,6 +250,8 @@ class ArrivalTimeline:
         elapsed_s = (arrived_ns - max(self.arrived_ns, self._stall_end_ns or 0)) / NS_PER_S
         is_backlog = (arrived - BURST_PERIODS) * period_s > elapsed_s
         if self._stall_end_ns is not None and arrived_ns >= self._stall_end_ns:
+            if self._line_is_backlog and not self.nominal_hz:  # the line gives the rate at which the backlog was read
+                is_backlog = arrived_ns - self._stall_end_ns < UNKNOWN_BACKLOG_NS
             if is_backlog:
                 return 0
             self._delay = self._stall_end_ns = None

@@ -125,7 +125,7 @@ class CounterGaps:
         )
         if not steps.any():  # a stuck counter says nothing about missing samples
             missing[0] = unseen
-        elif self._has_jumped(missing, steps, arrived_ns):
+        elif missing.any() and self._has_jumped(missing, steps, arrived_ns):
             self._discard_jump(samples, missing, steps, first)
         if first:
             missing[0] = unseen

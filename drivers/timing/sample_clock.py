@@ -262,8 +262,8 @@ class SampleClock:
 
     def _count_missing(self, samples: SampleBlock) -> Ints:
         """Return the number of missing samples before each sample [n], from the counter or from arrival times."""
-        if self._paused and self.configured_or_measured_rate_hz is None:
-            self._timeline.restart_line()  # the number of missing samples is unknown
+        if self._paused and not self._timeline.line.has_enough_points_for_gaps:
+            self._timeline.restart_line()  # without a measured rate, the number of missing samples is uncertain
         if self._counter is not None and (samples.ticks != NO_TICK).all():
             missing = self._counter.count_missing(samples, self._paused)
         else:

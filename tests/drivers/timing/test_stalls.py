@@ -1,11 +1,14 @@
 """Tests of sample times after a stall of the reader, with simulated buffers that keep the oldest data and overflow."""
 
+import time
+
 import numpy as np
 import pytest
 
 from drivers.data_types import NS_PER_S, ArrivalTimedFormat, Chunk, CounterTimedFormat, Timing, make_block
 from drivers.decoders.text_lines import text
 from drivers.driver import Driver
+from drivers.errors import LinkEnded
 from drivers.links import unix_to_monotonic_arrival
 from drivers.timing.sample_clock import SampleClock
 from tests.support.loopback_link import LoopbackLink
@@ -68,13 +71,40 @@ def test_stall_neither_bends_times_nor_miscounts(
     assert clock.take_events() == []
 
 
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize("backlog_reads", [0, 1, 4])
+def test_data_that_waited_before_the_link_was_opened_do_not_bend_the_rate(
+    backlog_reads: int, configured: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder = text.build(read_settings(text.Settings, {"columns": ["gx"], "first_line": "keep"}))
+    link, blocks, opened_s = LoopbackLink(), [], time.monotonic()
+    clock = SampleClock(decoder.timing, RATE_HZ if configured else None)
+    driver = Driver("a", link, decoder, clock, blocks.append)
+    reads = [(opened_s + 0.002 * i, 300) for i in range(backlog_reads)]
+    reads += [(opened_s + 0.04 * i, 4) for i in range(1, 500)]
+
+    def read(timeout_s: float) -> list[Chunk]:
+        if not reads:
+            raise LinkEnded("end")
+        t_s, n = reads.pop(0)
+        return [Chunk(b"0.1\n" * n, round(t_s * NS_PER_S))]
+
+    monkeypatch.setattr(link, "wait_for_chunks_or_timeout", read)
+    driver.run()
+    newest_s = np.concatenate([block.t_ns for block in blocks])[-1996 + round(RATE_HZ) :: 4] / NS_PER_S
+    assert clock.measured_hz == pytest.approx(RATE_HZ, rel=1e-4)
+    assert np.ptp(newest_s - np.arange(newest_s.size) * 0.04) < 0.005
+    assert driver.counts.lost == 0
+    assert [event.kind for event in driver.take_events()] == []
+
+
 def test_stopped_driver_reports_no_lost_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """A read may time out after the process was stopped, although data are waiting."""
     decoder = text.build(read_settings(text.Settings, {"columns": ["gx"], "first_line": "keep"}))
     link, rows, now_s = LoopbackLink(), [], [START_S]
-    for name in ("monotonic", "_read_suspend_aware_clock_s"):
-        target = "drivers.driver.time.monotonic" if name == "monotonic" else f"drivers.driver.{name}"
-        monkeypatch.setattr(target, lambda: now_s[0])
+    for name in ("time.monotonic", "_read_suspend_aware_clock_s"):
+        monkeypatch.setattr(f"drivers.driver.{name}", lambda: now_s[0])
+    monkeypatch.setattr("drivers.driver.time.monotonic_ns", lambda: round(now_s[0] * NS_PER_S))
     driver = Driver("a", link, decoder, SampleClock(decoder.timing, RATE_HZ), rows.append, silence_s=3.0)
     link.open()
 

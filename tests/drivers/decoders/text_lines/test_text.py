@@ -95,6 +95,19 @@ def test_unreadable_line_is_bad_and_counts_as_lost(line: bytes) -> None:
     assert decoder.bad == 1
 
 
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ([b"1,2,", b"3,4,5,6\n", LINE], [(2, 0)]),
+        ([LINE, b"garbage", LINE, LINE], [(1, 0), (1, 1)]),
+        ([LINE, b"1,2,#,", b"4,5,6\n", LINE], [(1, 0), (1, 1)]),  # the end of a damaged line is not read as a line
+    ],
+)
+def test_end_of_a_datagram_does_not_end_a_line(parts: list[bytes], expected: list[tuple[int, int]]) -> None:
+    decoder = build(Settings(columns=AXES, first_line="keep"))
+    assert [(len(b), b.lost) for b in decoder.feed([Chunk(part, 77) for part in parts])] == expected
+
+
 def test_recent_problem_describes_the_error_until_lines_are_good() -> None:
     decoder = build(Settings(columns=AXES))
     decoder.feed([Chunk(b"\n1,2,3\n", 0)])
