@@ -63,9 +63,9 @@ class RecordingAnalysis:
     bandwidth_hz: Floats  # [6] cutoff frequency of the sensor's low-pass filter; NaN if no filter has been found
     motions: tuple[MotionEpisode, ...] = ()
     changes: tuple[Change, ...] = ()
-    pauses: Ints = field(default_factory=lambda: NO_PAUSES)  # rows of ``values`` that stand for a long gap
     motion_removed: bool = False  # True if ``values`` contains no samples in motion
     axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the bias variance
+    pauses: Ints = field(default_factory=lambda: NO_PAUSES)  # rows of ``values`` that stand for a long gap
 
 
 def analyze(
