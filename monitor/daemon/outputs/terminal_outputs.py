@@ -69,7 +69,7 @@ class EventAndStatusLogOutput(Output):
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Write a log line for an event, or hold the event if it is a repetition."""
-        self._write_or_hold(device, ("event", event.kind, event.axis), event.text, event, 0)
+        self._write_or_hold(device, ("event", event.kind, event.axis or ""), event.text, event, 0)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Write a log line if the status has changed, and write held repetitions whose time has come."""
