@@ -17,8 +17,10 @@ MAX_STEP: Final = 6.0
 """Limit of the log likelihood ratio of one read."""
 MIN_VARIANCE: Final = 0.01
 """Minimum assumed variance of the number of samples per read, in square sample periods."""
-VARIANCE_WEIGHT: Final = 0.05
-"""Weight of the newest read in the variance."""
+MIN_READS: Final = 50
+"""Number of reads from which the variance is estimated before the first decision."""
+VARIANCE_WEIGHT: Final = 1.0 / MIN_READS
+"""Minimum weight of the newest read in the variance. The first reads have equal weights."""
 OUTLIER_SIGMA: Final = 3.0
 """Deviation in standard deviations, plus one sample period, above which a read is late and is not used."""
 
@@ -32,7 +34,7 @@ class RejectedFrameTest:
     >>> [test.count_missing(0.01 * i, samples=1, rejected=5, period_s=0.01) for i in range(4)]  # no time for samples
     [0, 0, 0, 0]
     >>> test = RejectedFrameTest()
-    >>> sum(test.count_missing(0.03 * i, samples=1, rejected=2, period_s=0.01) for i in range(100)) > 150
+    >>> sum(test.count_missing(0.03 * i, samples=1, rejected=2, period_s=0.01) for i in range(200)) > 250
     True
     """
 
@@ -40,6 +42,7 @@ class RejectedFrameTest:
         self._were_samples = False
         self._log_ratio = 0.0
         self._variance = 1.0
+        self._reads = 0  # number of reads in the variance
         self._previous_s = self._read_s = -inf  # arrival times of the last two reads
         self._samples = self._rejected = self._missing = 0  # in the newest read
 
@@ -82,9 +85,9 @@ class RejectedFrameTest:
         return 1.0 + OUTLIER_SIGMA * sqrt(self._variance)
 
     def _read_log_ratio(self, excess: float) -> float:
-        """Return the log likelihood ratio of the newest read, or 0 if the read is an outlier."""
+        """Return the log likelihood ratio of the newest read, or 0 for an outlier or without a variance."""
         most = self._max_deviation()
-        if not -most < excess < self._rejected + most:
+        if self._reads < MIN_READS or not -most < excess < self._rejected + most:
             return 0.0
         ratio = self._rejected * (excess - 0.5 * self._rejected) / self._variance
         return min(max(ratio, -MAX_STEP), MAX_STEP)
@@ -96,4 +99,6 @@ class RejectedFrameTest:
             self._log_ratio = min(max(log_ratio, -MAX_LOG_RATIO), MAX_LOG_RATIO)
             self._were_samples = self._log_ratio > (-DECISION if self._were_samples else DECISION)
         deviation = min(abs(excess), abs(excess - self._rejected), 2.0 * self._max_deviation())
-        self._variance += VARIANCE_WEIGHT * (max(deviation * deviation, MIN_VARIANCE) - self._variance)
+        self._reads += 1
+        weight = max(VARIANCE_WEIGHT, 1.0 / self._reads)
+        self._variance += weight * (max(deviation * deviation, MIN_VARIANCE) - self._variance)
