@@ -7,6 +7,7 @@ import pytest
 
 from drivers.data_types import NS_PER_S, ArrivalTimedFormat, Chunk, CounterTimedFormat, Timing, make_block
 from drivers.decoders.text_lines import text
+from drivers.decoders.text_lines.text.settings import Settings
 from drivers.driver import Driver
 from drivers.errors import LinkEnded
 from drivers.links import unix_to_monotonic_arrival
@@ -76,7 +77,7 @@ def test_stall_neither_bends_times_nor_miscounts(
 def test_data_that_waited_before_the_link_was_opened_do_not_bend_the_rate(
     backlog_reads: int, configured: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    decoder = text.build(read_settings(text.Settings, {"columns": ["gx"], "first_line": "keep"}))
+    decoder = text.build(read_settings(Settings, {"columns": ["gx"], "first_line": "keep"}))
     link, blocks, opened_s = LoopbackLink(), [], time.monotonic()
     clock = SampleClock(decoder.timing, RATE_HZ if configured else None)
     driver = Driver("a", link, decoder, clock, blocks.append)
@@ -100,7 +101,7 @@ def test_data_that_waited_before_the_link_was_opened_do_not_bend_the_rate(
 
 def test_stopped_driver_reports_no_lost_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """A read may time out after the process was stopped, although data are waiting."""
-    decoder = text.build(read_settings(text.Settings, {"columns": ["gx"], "first_line": "keep"}))
+    decoder = text.build(read_settings(Settings, {"columns": ["gx"], "first_line": "keep"}))
     link, rows, now_s = LoopbackLink(), [], [START_S]
     for name in ("time.monotonic", "_read_suspend_aware_clock_s"):
         monkeypatch.setattr(f"drivers.driver.{name}", lambda: now_s[0])

@@ -7,6 +7,7 @@ import pytest
 
 from drivers.data_types import ArrivalTimedFormat, make_block
 from drivers.decoders.text_lines import text
+from drivers.decoders.text_lines.text.settings import Settings
 from drivers.driver import Driver
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
@@ -22,7 +23,7 @@ def test_slew_keeps_the_order_of_samples_ahead_of_the_host_clock(step_ns: int, m
     now_ns, unix_ns = 10**14, 17 * 10**17
     monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(time, "time_ns", lambda: unix_ns)
-    decoder = text.build(read_settings(text.Settings, {"columns": ["gx"]}))
+    decoder = text.build(read_settings(Settings, {"columns": ["gx"]}))
     driver = Driver("a", LoopbackLink(), decoder, SampleClock(ArrivalTimedFormat(), None), lambda samples: None)
     timeline = DeviceTimeline(driver)
     times_ns = []
