@@ -21,6 +21,7 @@ from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart_geometry import (
     HEIGHT,
     LABEL_ABOVE,
+    RING_RADIUS,
     WIDTH,
     ChartDecadeRange,
     band_outline,
@@ -52,8 +53,8 @@ KEY_TEXT: Final = 3.3
 GRID_DASH: Final = 0.15
 FEW_TICKS: Final = "few_ticks"
 """Last part of the path of the tick labels for small plots."""
-LETTER_OFFSETS: Final = {"N": (-0.9, -0.3), "B": (0.9, -0.3), "K": (0.9, -0.3)}
-"""Position of each letter relative to its rings, on the side where the curve leaves space."""
+LETTER_OFFSETS: Final = {"N": (-0.8, -LABEL_ABOVE), "B": (0.8, -LABEL_ABOVE), "K": (0.8, -LABEL_ABOVE)}
+"""Position of each letter relative to its lowest ring, if the plot has no space below this ring."""
 FIT_WIDTH: Final = 1.25  # half of the line width [points of the screen]
 MODEL_WIDTH: Final = 0.75
 RING_WIDTH: Final = 0.9
@@ -195,7 +196,12 @@ class AllanPlotPair:
             for letter, xy in inside.items():
                 lines.append(_Line(ring_outline(*xy), axis_colours.AXIS_COLOURS[axis], RING_WIDTH))
                 letters.setdefault(letter, []).append(xy)
-        labels = [(*(np.mean(xy, axis=0) + LETTER_OFFSETS[letter]), letter) for letter, xy in letters.items()]
+        labels = []
+        for letter, positions in letters.items():
+            lowest = max(positions, key=lambda xy: float(xy[1]))
+            space_below = HEIGHT - lowest[1] > RING_RADIUS + 2.0 * LABEL_ABOVE
+            x, y = lowest + ((0.0, RING_RADIUS) if space_below else LETTER_OFFSETS[letter])
+            labels.append((float(x), float(y), letter))
         return lines, label_points(labels)
 
     def _draw_points_and_list_lines(self, scale: ChartDecadeRange, curve: "_Curve") -> "list[_Line]":

@@ -160,12 +160,13 @@ def _now(name: str, waiting: bool, units: UnitSystem) -> rrb.Container:
             _guide(name, "now"),
             active_tab=0,
         ),
-        row_shares=[2.0, 4.1],
+        _event_list(f"/{name}/events"),
+        row_shares=[1.9, 3.5, 2.4],
     )
     right = rrb.Vertical(
         rrb.Horizontal(*(_allan(name, kind, units) for kind in KINDS)),
         rrb.Horizontal(*(_coefficient(name, kind, symbol, units) for kind in KINDS for symbol in NOW_COEFFICIENTS)),
-        rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), _event_list(f"/{name}/events"), column_shares=[4, 4, 6]),
+        rrb.Horizontal(*(_raw(name, kind) for kind in KINDS)),
         row_shares=[5.0, 2.2, 2.2],
     )
     return rrb.Horizontal(left, right, column_shares=[1, 2], name="Device")

@@ -10,7 +10,7 @@ from monitor.estimation.detection.comparison_with_noise_model import ModelCompar
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours
 from monitor.publishing.plots.allan_figure import READING_TAU_S
-from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, LABEL_ABOVE, WIDTH
+from monitor.publishing.rerun.allan_chart_geometry import HEIGHT, LABEL_ABOVE, RING_RADIUS, WIDTH, ChartDecadeRange
 from monitor.publishing.rerun.allan_drawing import (
     DISCONNECTED_TEXT,
     DOT_RADIUS,
@@ -117,3 +117,42 @@ def test_ring_of_n_is_at_one_second_and_at_the_level_of_n() -> None:
     expected = np.interp(np.log10(n_degrees_per_hour), np.log10(levels[::-1]), heights[::-1])
     np.testing.assert_allclose(y, expected, atol=1e-3)
     assert 0.0 < x < WIDTH
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5])
+def test_letter_is_directly_below_its_lowest_ring_even_if_the_axes_differ(factor: float) -> None:
+    estimate = make_estimate()
+    scale = np.array([1.0, factor, factor, 1.0, 1.0, 1.0])  # a plot whose gx has the smallest coefficients
+    coefficients, curve = estimate.coefficients, estimate.curve
+    shown = draw_example(
+        replace(
+            estimate,
+            coefficients=replace(coefficients, value=coefficients.value * scale),
+            curve=replace(curve, avar=curve.avar * scale**2, lo=curve.lo * scale, hi=curve.hi * scale),
+            fitted=estimate.fitted * scale**2,
+        )
+    )
+    letters = shown["d/gyro/letters"]
+    at = dict(zip(list_labels(letters), letters.positions.as_arrow_array().to_pylist(), strict=True))
+    axes = ("gx", "gy", "gz")
+    rings = [
+        np.mean(outline[:-1], axis=0)
+        for axis in axes
+        for outline in select_lines(shown["d/gyro/curves"], axis_colours.AXIS_COLOURS[axis], RING_WIDTH)
+    ]
+    assert {"N", "B"} <= set(at)
+    for x, y in at.values():
+        lowest = max(ring[1] for ring in rings if abs(ring[0] - x) < 1e-4)
+        assert y == pytest.approx(lowest + RING_RADIUS, abs=1e-4)
+
+
+def test_letter_without_space_below_its_ring_is_beside_it() -> None:
+    estimate = make_estimate()
+    low = replace(estimate.coefficients, value=estimate.coefficients.value.copy())
+    scale = ChartDecadeRange((0, 1), (0, 1))
+    plots = AllanPlotPair(lambda *_: None, "d")
+    for kind, axes in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
+        low.value[1, axes] = 1.05 / plots._units.deviation(kind).factor  # N just above the lower end of the plot
+        _, letters = plots._rings_and_letters(kind, scale, replace(estimate, coefficients=low))
+        (x, y) = dict(zip(list_labels(letters), letters.positions.as_arrow_array().to_pylist(), strict=True))["N"]
+        assert (x, y + LABEL_ABOVE) == pytest.approx((-0.8, HEIGHT * (1.0 - np.log10(1.05))), abs=1e-3)

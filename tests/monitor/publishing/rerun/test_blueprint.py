@@ -38,6 +38,15 @@ def test_device_has_the_pages_of_its_features() -> None:
     assert [page.name for page in several.contents] == ["Overview", "nose", "tail"]
 
 
+def test_events_are_below_the_coefficients() -> None:
+    """The table of the coefficients needs less than half of the height of its column."""
+    left, right = blueprint([FULL]).root_container.contents[0].contents
+    assert [str(view.origin) for view in list_views(left)] == [
+        *("/b/status", "/b/coefficients", "b/guide/now", "/b/events")
+    ]
+    assert "/b/events" not in [str(view.origin) for view in list_views(right)]
+
+
 def test_device_without_data_has_its_state_and_a_guide() -> None:
     assert list_origins(FULL, entities=set()) == ["/b/status", "b/guide/now"]
     assert list_origins(FULL, entities={"/b/waiting"}) == ["/b/waiting", "b/guide/now"]
