@@ -22,7 +22,7 @@ USE_ALL_KERNELS = """
     from monitor.daemon.kernels import kernel_groups
     from monitor.common.compiled import Kernel
     from monitor.drift.compensation.gyro_drift_compensator import Compensator
-    from monitor.drift.thermal import thermal_response
+    from monitor.drift.thermal import interval_regression, thermal_response
     from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
     from monitor.estimation.estimator import Estimator
 
@@ -66,6 +66,9 @@ USE_ALL_KERNELS = """
         while estimator.step_slow_statistics() is None:
             pass
     thermal_response.apply_first_order_lag(values[:, 0].copy(), 0.5)
+    known = np.ones(50, bool)
+    tested = interval_regression.f_test(values[:50, 0], values[:50, 1:2], values[:50, 2:3], known)
+    interval_regression.estimate_white_noise(values[:50, 0], known, tested.noise)
     print(json.dumps([before, count_signatures(), len(found)]))
 """
 LIST_COMPILATIONS = """

@@ -92,10 +92,11 @@ def _call_refit() -> None:
     Estimator(100.0, 1.0, every_sample=True).add_samples(_samples(100))
 
 
-def _call_temperature_lag() -> None:
-    from monitor.drift.thermal import thermal_response
+def _call_thermal_model() -> None:
+    from monitor.drift.thermal import interval_regression, thermal_response
 
     thermal_response.apply_first_order_lag(np.zeros(2), 0.5)
+    interval_regression.whiten_columns(np.zeros((2, 1)), np.ones(2, np.bool_), interval_regression.NOISE_MODELS)
 
 
 def _call_analysis() -> None:
@@ -132,7 +133,7 @@ SERVICE: Final = KernelGroup(
         KernelPart("drift compensation", _call_compensation),
         KernelPart("total and Hadamard deviation", _call_slow_statistics),
         KernelPart("refit at every sample", _call_refit),
-        KernelPart("temperature lag", _call_temperature_lag),
+        KernelPart("thermal model", _call_thermal_model),
     ),
 )
 """Parts that the service needs, in order of use."""

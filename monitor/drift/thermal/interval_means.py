@@ -10,6 +10,8 @@ from drivers.data_types import AXES, Floats, Ints
 PARTS_PER_INTERVAL: Final = 8
 """Number of parts into which an interval is divided to estimate the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
+MAX_MEANS: Final = 150
+"""Maximum number of interval means in a regression. Longer recordings are averaged in groups of intervals."""
 BUFFER_ROWS: Final = 1024
 TEMPERATURE_COLUMN: Final = len(AXES)
 
@@ -27,6 +29,47 @@ class IntervalMeans:
     def both_known(self) -> np.ndarray:
         """Return a mask [n] that is True for intervals in which both bias and temperature are known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
+
+
+def interpolate_missing_temperatures(temperature_c: Floats) -> Floats:
+    """Replace missing temperatures [n] by interpolated values."""
+    there = np.flatnonzero(np.isfinite(temperature_c))
+    return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
+
+
+class Grouping:
+    """Division of intervals into groups of equal length, so that there are at most MAX_MEANS groups.
+
+    Intervals before the first complete group are ignored. A group is known if at least half of its intervals are known.
+    """
+
+    def __init__(self, known: np.ndarray) -> None:
+        self.size = -(-known.size // MAX_MEANS)
+        self._first = known.size % self.size
+        self._members = known[self._first :].reshape(-1, self.size)
+        self.counts = self._members.sum(axis=1)
+        self.known: np.ndarray = 2 * self.counts >= self.size
+
+    def average(self, columns: Floats, known_only: bool = True) -> Floats:
+        """Return the mean [groups, m] of the known rows of each group, or of all rows."""
+        rows = columns[self._first :].reshape(*self._members.shape, -1)
+        if not known_only:
+            return np.asarray(rows.mean(axis=1))
+        total = np.where(self._members[:, :, None], rows, 0.0).sum(axis=1)
+        return np.asarray(total / np.maximum(self.counts, 1)[:, None])
+
+
+def average_groups(means: IntervalMeans) -> IntervalMeans:
+    """Return the interval means, averaged in groups if there are more than MAX_MEANS of them."""
+    grouping = Grouping(means.both_known)
+    if grouping.size == 1:
+        return means
+    temperature_c = grouping.average(interpolate_missing_temperatures(means.temperature_c)[:, None], False)[:, 0]
+    bias, error = grouping.average(np.stack([means.bias, means.error], axis=1)).T
+    bias[~grouping.known] = np.nan
+    return IntervalMeans(
+        grouping.size * means.interval_s, bias, error / np.sqrt(np.maximum(grouping.counts, 1)), temperature_c
+    )
 
 
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:

@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from monitor.common.distributions import Z95
-from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
 """A change is suspected if at least this many recent biases are outside the prediction interval on the same side."""
@@ -21,6 +20,19 @@ WINDOW_INTERVALS: Final = 6
 """Number of recent intervals with a known bias that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0
 """Maximum deviation from the prediction at which a bias is used for the fit, in half-widths of the interval."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionInterval:
+    """Predicted mean bias in one interval, with a 95 % prediction interval, in rad/s or m/s²."""
+
+    bias: float
+    lo: float
+    hi: float
+
+    def side_of_interval(self, bias: float) -> int:
+        """Return 1 if a bias lies above the prediction interval, -1 if it lies below, and 0 otherwise."""
+        return int(bias > self.hi) - int(bias < self.lo)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Noise coefficients of a recording after removal of the temperature dependence of the bias.
 
-The bias of each axis is tested for a dependence on temperature. A significant dependence is modelled and subtracted
-from the samples, and the noise coefficients are computed again. A thermal model can follow part of a random walk by
-chance. A change of K or R by a few percent is therefore not significant.
+``fit_thermal_model`` decides whether the bias of an axis depends on temperature. The thermal model of a significant
+dependence is subtracted from the samples, and the noise coefficients are computed again. A thermal model can follow
+part of a random walk by chance. A change of K or R by a few percent is therefore not significant.
 """
 
 from collections.abc import Mapping
@@ -13,15 +13,32 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
-from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence, find_temperature_dependence
 from monitor.drift.thermal.interval_means import compute_interval_means
-from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice_for_fit, fit_thermal_model
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, ThermalFit, fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_results import choose_interval_s
 from monitor.estimation.analysis import RecordingAnalysis, fit_other_samples
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
 
-SLOW_LETTERS: Final = ("K", "R")
+SLOW_LETTERS: Final = ("B", "K", "R")
+MAIN_SHARE: Final = 0.5
+"""Minimum explained share of the variance at which temperature is said to explain most of the variance."""
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureDependence:
+    """Significant dependence of a bias on temperature."""
+
+    share: float  # share of the variance of the interval means that temperature explains
+    p_value: float  # p-value of the null hypothesis that the bias does not depend on temperature
+    form: str  # name of the thermal model, with " with hysteresis" if heating and cooling differ
+    one_way: bool  # True if the temperature only rose or only fell
+    interval_s: float
+
+    @property
+    def explains_most_variance(self) -> bool:
+        """Return True if temperature explains at least half of the bias variance."""
+        return self.share >= MAIN_SHARE
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +129,14 @@ def remove_temperature_effect(
     for at, axis in enumerate(AXES):
         means = compute_interval_means(analysis.values[:, at], temperature_c, rate_hz, interval_s)
         try:
-            check_means_suffice_for_fit(means)
+            found = fit_thermal_model(means)
         except NotReady:
             continue
-        dependence = find_temperature_dependence(means)
+        dependence = find_temperature_dependence(found)
         if dependence is None:
             continue
-        dependences[axis] = dependence
-        model = fit_thermal_model(means).model
-        if model.shape.difference_equation_order or model.shape.powers:
+        dependences[axis], model = dependence, found.model
+        if found.explained > 0.0:
             values = values.copy() if values is analysis.values else values
             course = predict_interval_means(model, means.temperature_c, starts_with_fit=True).bias
             values[:, at] -= interpolate_with_zero_mean(course, round(means.interval_s * rate_hz), len(values))
@@ -133,6 +149,25 @@ def remove_temperature_effect(
         fit = fit_other_samples(analysis, values)
         after, k_or_r = fit.coefficients, fit.k_or_r
     return TemperatureRemovalComparison(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+
+
+def find_temperature_dependence(found: ThermalFit) -> TemperatureDependence | None:
+    """Return the dependence of a bias on temperature that a thermal fit found, or None if there is none."""
+    shape = found.model.shape
+    loop = found.hysteresis if found.hysteresis is not None and found.hysteresis.is_significant else None
+    if shape.is_constant and loop is None:
+        return None
+    if loop is None or loop.share < found.explained + 0.01:  # prefer the simpler form
+        return TemperatureDependence(
+            found.explained, found.p_value, shape.name, not found.temperature_rose_and_fell, found.model.interval_s
+        )
+    return TemperatureDependence(
+        loop.share,
+        loop.p_value,
+        f"{shape.name} with hysteresis",
+        not found.temperature_rose_and_fell,
+        found.model.interval_s,
+    )
 
 
 def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n_samples: int) -> Floats:

@@ -1,23 +1,24 @@
 """Selection and fit of a thermal model, which describes the bias as a function of temperature.
 
-Polynomials and difference equations are fitted to interval means of bias and temperature by least squares. Difference
-equations are evaluated with predicted values, because noise in measured values would bias the roots towards zero.
-Successive residuals may be correlated: r_n = φ r_{n−1} + e_n.
+The simplest model wins. The search starts with a constant bias. A term is added only if an F test in a generalised
+least-squares regression finds it significant beside the slow noise of the axis (``interval_regression``):
 
-The model with the smallest AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). Asymptotically, the AICc agrees with
-cross-validation (Stone, J. R. Stat. Soc. B, 1977). Lags and powers above the third must improve the AICc by a margin. A
-model is rejected if its cross-validated error exceeds that of a constant, because slow heating leaves one end of a
-polynomial unconstrained. The selection takes 50 ms to 1 s.
+1. Powers of the temperature are added in ascending order. If the next power alone is not significant, it is tested
+   together with the following ones.
+2. If the temperature rose and fell, first-order lags are added one by one. The time constant comes from a search, for
+   which the p-value is corrected. Powers that are not significant beside the lag are dropped again.
 
-The method follows Wang et al., who modelled the bias of MEMS gyroscopes with 72 hourly means and small temperature
-changes. The constant term and the use of predicted values extend that method.
+If the temperature rose and fell, a linear drift of the bias with time is part of the null hypothesis. If the
+temperature only rose or only fell, a drift with time cannot be distinguished from a dependence on temperature.
+
+The difference equation follows Wang et al., who modelled the bias of MEMS gyroscopes with 72 hourly means and small
+temperature changes. The constant term and the tests extend that method.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import pairwise
-from math import log
+from math import inf
 from typing import Final, TypeVar
 
 import numpy as np
@@ -25,21 +26,42 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import NotReady
 from drivers.validation.number_ranges import HOUR_S
-from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, temperature_noise_c
-from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.common.distributions import student_quantile
+from monitor.drift.thermal.hysteresis import (
+    Hysteresis,
+    find_hysteresis,
+    heating_direction,
+    rose_and_fell,
+    temperature_noise_c,
+)
+from monitor.drift.thermal.interval_means import Grouping, IntervalMeans, interpolate_missing_temperatures
+from monitor.drift.thermal.interval_regression import (
+    CoefficientEstimate,
+    RegressorTest,
+    estimate_coefficients,
+    f_test,
+    max_log_likelihood,
+)
 from monitor.drift.thermal.thermal_model import (
     ThermalModel,
     bias_derivatives_by_log_time_constant,
-    coefficient_covariance,
-    interpolate_missing_temperatures,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors, solve_least_squares
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 MIN_INTERVALS: Final = 12
-MAX_POWER: Final = 5
+SIGNIFICANCE: Final = 0.02
+"""Maximum p-value at which a term is added, after Bonferroni correction."""
 CUBIC: Final = 3
-"""Highest order of a polynomial that is accepted without a margin in the AICc."""
+HIGH_POWER_SIGNIFICANCE: Final = 0.001
+"""Maximum p-value of powers above the third."""
+MAX_POWER: Final = 5
 MAX_LAGS: Final = 3
+CONSTANT: Final = ThermalModelForm(0, ())
+LAG_TRIALS: Final = 5
+"""Number of independent tests to which the search for a time constant corresponds.
+
+Regressors with neighbouring time constants are correlated.
+"""
 INTERVALS_PER_SQUARED_LAGS: Final = 8
 """Minimum number of intervals for a model with k lags, divided by k².
 
@@ -52,48 +74,57 @@ MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
 MIN_TIME_CONSTANT_RATIO: Final = 2.0
 """Minimum ratio of two time constants. Closer time constants would get large coefficients that cancel each other."""
 GRID_POINTS: Final = 20
-PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
-FOLDS: Final = 6
-"""Number of parts into which the recording is divided for cross-validation."""
-MAX_ERROR_RATIO: Final = 1.05
-"""Maximum cross-validated error of an accepted model, relative to the error of a constant."""
-LAG_AICC_MARGIN: Final = 6.0
-"""Minimum AICc improvement of a model with lags. With few intervals, noise can resemble a lag."""
-CURVE_AICC_MARGIN: Final = 10.0
-"""Minimum AICc improvement of a power above the third, because noise can resemble a higher power."""
 MIN_SWING_C: Final = 0.1
 """Minimum temperature range for a fit, °C."""
 MIN_SWING_SIGMAS: Final = 5.0
 """Minimum temperature range for a fit, in standard errors of a mean temperature."""
-MIN_REVERSE_SHARE: Final = 0.1
-"""The temperature counts as having risen and fallen if rises and falls each exceed this share of the total change."""
 GOLDEN_STEPS: Final = 10
 GOLDEN_RATIO: Final = 0.6180339887498949
+MAX_PHI: Final = 0.99
+"""Maximum correlation of the residuals of successive intervals, because a larger one would give no finite variance."""
 
 
 @dataclass(frozen=True, slots=True)
-class CandidateModel:
-    """Fitted thermal model that was considered in a model selection."""
+class TermTest:
+    """Test of whether a thermal model needs more terms."""
 
-    shape: ThermalModelForm
-    aicc: float  # AICc minus the AICc of the selected form; negative if a form with a lower AICc was rejected
-    rms: float  # rms residual of the multi-step prediction, rad/s or m/s²
-    validated: float  # cross-validated rms error, rad/s or m/s²
+    shape: ThermalModelForm  # form with the additional terms
+    p_value: float  # p-value after Bonferroni correction of the hypothesis that the simpler form suffices
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalFit:
-    """Selected thermal model of an axis, with all candidate models."""
+    """Selected thermal model of an axis, with the tests that selected it."""
 
     model: ThermalModel
-    candidates: tuple[CandidateModel, ...]  # the selected form, followed by the others in the order of their AICc
+    tests: tuple[TermTest, ...]  # in the order of the search
     temperature_rose_and_fell: bool
     explained: float  # share of the variance of the interval means that the model explains
-    aicc: float  # AICc, only comparable between fits to the same interval means
+    rms: float  # rms residual of the multi-step prediction, rad/s or m/s²
+    degrees_of_freedom: int
+    p_value: float = 1.0  # p-value of the null hypothesis that the bias does not depend on temperature
     step: float = 0.0  # fitted bias step (after minus before), rad/s or m/s²
-    hysteresis: float | None = None  # largest difference between heating and cooling at one temperature, rad/s or m/s²;
-    # 0 if noise explains the difference; None if temperature did not both rise and fall, or if there was no test
-    hysteresis_p: float | None = None  # p-value of the null hypothesis that heating and cooling do not differ
+    step_p: float = 1.0  # p-value of the null hypothesis that there is no bias step
+    hysteresis: Hysteresis | None = None  # None if temperature did not both rise and fall, or if there was no test
+
+    @property
+    def slope_interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the mean slope, in rad/s or m/s² per °C."""
+        slope, half = self.model.mean_bias_slope, float(self.half_widths(self.model.slope_gradient))
+        return slope - half, slope + half
+
+    @property
+    def time_constant_intervals_s(self) -> list[tuple[float, float]]:
+        """Return the 95 % interval of each time constant in seconds."""
+        constants = self.model.shape.constants_s
+        size = self.model.covariance.shape[0]
+        widths = np.exp(self.half_widths(np.eye(size)[size - len(constants) :])).tolist()
+        return [(constant / width, constant * width) for constant, width in zip(constants, widths, strict=True)]
+
+    def half_widths(self, gradients: Floats) -> Floats:
+        """Return half the width of the 95 % interval [m] of linear combinations [m, parameters] of the parameters."""
+        variance = np.einsum("...i,ij,...j->...", gradients, self.model.covariance, gradients)
+        return np.asarray(student_quantile(self.degrees_of_freedom, 0.975) * np.sqrt(variance))
 
 
 T = TypeVar("T")
@@ -110,10 +141,7 @@ def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
         If there are too few intervals, or if the temperature hardly changed.
     """
     found = _run_all_steps(fit_thermal_model_stepwise(means))
-    loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
-    if loop is None:
-        return found
-    return replace(found, hysteresis=loop.size if loop.hysteresis_is_significant else 0.0, hysteresis_p=loop.p_value)
+    return replace(found, hysteresis=find_hysteresis(means))
 
 
 def _run_all_steps(pieces: StepwiseWork[T]) -> T:
@@ -128,9 +156,9 @@ def _run_all_steps(pieces: StepwiseWork[T]) -> T:
 def fit_thermal_model_stepwise(
     means: IntervalMeans, first_after_step: int | None = None, always_try_lags: bool = False
 ) -> StepwiseWork[ThermalFit]:
-    """Select and fit a thermal model in steps of less than a millisecond.
+    """Select and fit a thermal model in steps of a few milliseconds.
 
-    Each call of ``next`` on the generator runs one least-squares fit.
+    Each call of ``next`` on the generator runs one test.
 
     Parameters
     ----------
@@ -139,7 +167,7 @@ def fit_thermal_model_stepwise(
     first_after_step : int or None
         Index of the first interval after a possible bias step, which is fitted as an additional coefficient.
     always_try_lags : bool
-        True to fit models with lags even if the temperature only rose or only fell.
+        True to test lags even if the temperature only rose or only fell.
 
     Raises
     ------
@@ -147,42 +175,16 @@ def fit_thermal_model_stepwise(
         If there are too few intervals, or if the temperature hardly changed.
     """
     check_means_suffice_for_fit(means)
-    excess, reference_c = _temperature_difference(means)
-    temperature_rose_and_fell = _both_ways(means.temperature_c)
-    tried = []
-    for shape in _shapes(means, temperature_rose_and_fell or always_try_lags):
-        tried.append((yield from _fit_shape(means, excess, shape, first_after_step)))
-    tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
-    errors = []
-    for one in tried:
-        yield
-        errors.append(_cross_validated_error(_without_step(means, first_after_step, one.step), excess, one))
-    alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == ThermalModelForm(0, ()))
-    at = next(i for i, error in enumerate(errors) if error <= MAX_ERROR_RATIO * alone)
-    best = tried.pop(at)
-    kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
-    candidates = tuple(CandidateModel(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
-    yield
-    means = _without_step(means, first_after_step, best.step)
-    model = _to_model(means, excess, reference_c, best)
-    known = means.both_known
-    left = means.bias[known] - (best.columns @ best.sizes)[known]
-    explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
-    return ThermalFit(model, candidates, temperature_rose_and_fell, explained, best.aicc, best.step)
+    search = _FormSearch(means, first_after_step)
+    yield from search.add_powers()
+    if search.temperature_rose_and_fell or always_try_lags:
+        yield from search.add_lags()
+    return search.fit()
 
 
-@dataclass(frozen=True, slots=True)
-class _ShapeFit:
-    """Least-squares fit of one model form."""
-
-    shape: ThermalModelForm
-    columns: Floats  # [n, terms + k] regressors
-    sizes: Floats  # [terms + k] coefficients
-    phi: float
-    sigma: float
-    rms: float
-    aicc: float
-    step: float
+def refit_coefficients(model: ThermalModel, means: IntervalMeans) -> ThermalFit:
+    """Fit the coefficients of a thermal model with known form and time constants."""
+    return _FormSearch(means, None, model.shape).fit()
 
 
 def check_means_suffice_for_fit(means: IntervalMeans) -> None:
@@ -211,255 +213,203 @@ def check_means_suffice_for_fit(means: IntervalMeans) -> None:
         raise NotReady("the bias is the same in all intervals")
 
 
-def _aicc_margin(shape: ThermalModelForm) -> float:
-    """Return the AICc improvement that is required to select a model form."""
-    if shape.difference_equation_order:
-        return LAG_AICC_MARGIN
-    return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
-
-
-def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
-    """Return the temperatures [n] relative to the reference temperature, and the reference temperature, in °C."""
-    known = interpolate_missing_temperatures(means.temperature_c)
-    reference_c = round(float(known.mean()), 2)
-    return known - reference_c, reference_c
-
-
-def _both_ways(temperature_c: Floats) -> bool:
-    """Return True if the temperature both rose and fell by more than MIN_REVERSE_SHARE of the total change."""
-    smooth = np.convolve(
-        np.pad(interpolate_missing_temperatures(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid"
-    )
-    moved = np.diff(smooth)
-    up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
-    return min(up, down) > MIN_REVERSE_SHARE * (up + down)
-
-
-def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
-    """Yield the model forms for which there are enough intervals."""
-    count = int(means.both_known.sum())
-    for powers in range(MAX_POWER + 1):
-        if powers + 3 < count / 2:
-            yield ThermalModelForm(powers, ())
-    for k in range(1, MAX_LAGS + 1):
-        for powers in (0, 1):
-            if lags and INTERVALS_PER_SQUARED_LAGS * k**2 < count:
-                yield ThermalModelForm(powers, tuple(means.interval_s * 2.0**i for i in range(k)))
-
-
-def _fit_shape(
-    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
-) -> StepwiseWork[_ShapeFit]:
-    """Find the best time constants and the best residual correlation φ of a model form."""
-    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).find_best_time_constants()
-    for phi in PHI_VALUES[1:]:
-        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).find_best_time_constants()
-        best = min(best, other, key=lambda one: one.aicc)
-    return best
-
-
-class _TimeConstantSearch:
-    """Search for the best time constants of a model form at a given residual correlation φ.
-
-    The time constants are selected one by one from a grid, and then refined by golden-section search. Two successive
-    evaluations differ in one time constant, so the whitened regressors of the others are kept.
-    """
-
-    def __init__(
-        self, means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None
-    ) -> None:
-        self._means, self._excess, self._shape, self._phi, self._since = means, excess, shape, phi, since
-        self._fastest = MIN_TIME_CONSTANT_INTERVALS * means.interval_s
-        self._slowest = MAX_TIME_CONSTANT_SHARE * means.interval_s * excess.size
-        self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
-        self._constants: tuple[float, ...] = ()
-        self._whitening = Whitening(means.both_known, phi)
-        self._values = self._whitening.whiten(np.where(means.both_known, means.bias, 0.0))
-        self._fixed = self._whiten_columns(replace(shape, constants_s=()))
-        self._step = [] if since is None else [self._whitening.whiten(_step_column(excess.size, since))]
-        self._lag_columns = lru_cache(MAX_LAGS + 1)(self._whiten_lag_columns)
-
-    def find_best_time_constants(self) -> StepwiseWork[_ShapeFit]:
-        """Find the best time constants, and return the fit."""
-        k = self._shape.difference_equation_order
-        for _ in range(k):
-            yield from self._add_from_grid()
-        for _ in range(2 if k > 1 else min(k, 1)):
-            for at in range(k):
-                yield from self._refine(at)
-        yield
-        shape = replace(self._shape, constants_s=tuple(sorted(self._constants)))
-        return _fit_sizes(self._means, self._excess, shape, self._phi, self._since)
-
-    def _whiten_columns(self, shape: ThermalModelForm) -> list[Floats]:
-        columns = build_regressors(shape, self._excess, self._means.interval_s, with_initial_state=True)
-        return [self._whitening.whiten(column) for column in columns.T]
-
-    def _whiten_lag_columns(self, constant: float) -> tuple[Floats, Floats]:
-        """Return the whitened lag of a time constant, and the whitened response to its initial state."""
-        _, lag, initial = self._whiten_columns(ThermalModelForm(0, (constant,)))
-        return lag, initial
-
-    def _evaluate(self, constants: tuple[float, ...]) -> StepwiseWork[float]:
-        """Return the AICc of a fit."""
-        yield
-        lags, initials = zip(*map(self._lag_columns, sorted(constants)), strict=True)
-        x = np.stack([*self._fixed, *lags, *initials, *self._step], axis=1)
-        sizes = solve_least_squares(x, self._values)
-        free = sizes.size + len(constants) + (self._phi > 0.0) + 1
-        return _compute_aicc(_residual_square(x, self._values, sizes), free, self._phi, self._whitening)
-
-    def _add_from_grid(self) -> StepwiseWork[None]:
-        """Add the best time constant on the grid that differs from the others by MIN_TIME_CONSTANT_RATIO or more."""
-        free = [
-            one
-            for one in self._grid.tolist()
-            if all(max(one / c, c / one) >= MIN_TIME_CONSTANT_RATIO for c in self._constants)
-        ]
-        scores = []
-        for one in free:
-            scores.append((yield from self._evaluate((*self._constants, one))))
-        self._constants = (*self._constants, free[int(np.argmin(scores))])
-
-    def _refine(self, at: int) -> StepwiseWork[None]:
-        lo, hi = self._bounds(at)
-        a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
-        below = yield from self._evaluate(self._replaced(at, a))
-        above = yield from self._evaluate(self._replaced(at, b))
-        for _ in range(GOLDEN_STEPS - 1):
-            if below < above:
-                hi, b, above = b, a, below
-                a = hi * (lo / hi) ** GOLDEN_RATIO
-                below = yield from self._evaluate(self._replaced(at, a))
-            else:
-                lo, a, below = a, b, above
-                b = lo * (hi / lo) ** GOLDEN_RATIO
-                above = yield from self._evaluate(self._replaced(at, b))
-        lo, hi = (lo, b) if below < above else (a, hi)
-        self._constants = self._replaced(at, (lo * hi) ** 0.5)
-
-    def _replaced(self, at: int, constant: float) -> tuple[float, ...]:
-        return (*self._constants[:at], constant, *self._constants[at + 1 :])
-
-    def _bounds(self, at: int) -> tuple[float, float]:
-        """Return the limits within which a time constant is refined, at most one grid step away."""
-        one, others = self._constants[at], (*self._constants[:at], *self._constants[at + 1 :])
-        ratio = float(self._grid[1] / self._grid[0])
-        below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=self._fastest)
-        above = min((other / MIN_TIME_CONSTANT_RATIO for other in others if other > one), default=self._slowest)
-        return max(one / ratio, self._fastest, min(below, one)), min(one * ratio, self._slowest, max(above, one))
-
-
-def _fit_sizes(
-    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None = None
-) -> _ShapeFit:
-    """Fit the coefficients of a model form by least squares with whitened regressors."""
-    known = means.both_known
-    columns = build_regressors(shape, excess, means.interval_s, with_initial_state=True)
-    own = columns.shape[1]
-    if since is not None:
-        columns = np.hstack([columns, _step_column(excess.size, since)[:, None]])
-    y = np.where(known, means.bias, 0.0)
-    whitening = Whitening(known, phi)
-    x, z = whitening.whiten(columns), whitening.whiten(y)
-    sizes = solve_least_squares(x, z)
-    square = _residual_square(x, z, sizes)
-    free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
-    rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
-    sigma = (square / max(len(z) - free + 1, 1)) ** 0.5
-    step = 0.0 if since is None else float(sizes[own])
-    aicc = _compute_aicc(square, free, phi, whitening)
-    return _ShapeFit(shape, columns[:, :own], sizes[:own], phi, sigma, rms, aicc, step)
-
-
-def _step_column(n: int, since: int) -> Floats:
-    return (np.arange(n) >= since).astype(np.float64)
-
-
-def _residual_square(x: Floats, z: Floats, sizes: Floats) -> float:
-    return max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
-
-
-def _compute_aicc(square: float, free: int, phi: float, whitening: "Whitening") -> float:
-    """Return the AICc of a fit with ``free`` parameters and the sum of squares of the whitened residuals."""
-    count = whitening.known_count
-    likelihood = count * log(square / count) - whitening.fresh_count * log(1.0 - phi**2)
-    return likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
-
-
-def _without_step(means: IntervalMeans, since: int | None, step: float) -> IntervalMeans:
-    if since is None:
-        return means
-    return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
-
-
-class Whitening:
-    """Filter that whitens residuals with the correlation φ between successive intervals.
-
-    From each row, φ times the previous row is subtracted. If the previous row is unknown, the row is scaled instead, so
-    that its residual has the same variance.
+class _FormSearch:
+    """Search for the simplest form of the thermal model of one axis.
 
     Parameters
     ----------
-    known : ndarray, shape (n,), bool
-        True where the value is known.
-    phi : float
-        Correlation between successive residuals.
+    means : IntervalMeans
+        Interval means.
+    since : int or None
+        Index of the first interval after a possible bias step.
+    shape : ThermalModelForm
+        Form with which the search begins.
     """
 
-    def __init__(self, known: np.ndarray, phi: float) -> None:
-        follows = known[1:] & known[:-1]
-        first = known.copy()
-        first[1:] &= ~follows
-        self._known = known
-        self._previous_weight = phi * follows
-        self._weight = np.where(first, (1.0 - phi**2) ** 0.5, 1.0)
-        self.known_count = int(known.sum())  # number of rows with known values
-        self.fresh_count = int(first.sum())  # number of known rows whose previous row is unknown
+    def __init__(self, means: IntervalMeans, since: int | None, shape: ThermalModelForm = CONSTANT) -> None:
+        self._means, self._shape, self._since = means, shape, since
+        self._tests: list[TermTest] = []
+        temperature_c = interpolate_missing_temperatures(means.temperature_c)
+        self._reference_c = round(float(temperature_c.mean()), 2)
+        self._excess = temperature_c - self._reference_c
+        self._grouping = Grouping(means.both_known)
+        self._y = self._grouping.average(means.bias[:, None])[:, 0]
+        self.temperature_rose_and_fell = rose_and_fell(heating_direction(temperature_c))
+        n = temperature_c.size
+        nuisance = [np.linspace(-1.0, 1.0, n)] if self.temperature_rose_and_fell else []
+        if since is not None:
+            nuisance.append((np.arange(n) >= since).astype(np.float64))
+        self._nuisance = np.reshape(nuisance, (len(nuisance), n)).T
+        self._fastest = MIN_TIME_CONSTANT_INTERVALS * means.interval_s
+        self._slowest = MAX_TIME_CONSTANT_SHARE * means.interval_s * n
+        self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
 
-    def whiten(self, rows: Floats) -> Floats:
-        """Whiten regressors [n, m] or values [n], and return the rows with known values."""
-        columns = rows.T
-        whitened = columns.copy()
-        whitened[..., 1:] -= self._previous_weight * columns[..., :-1]
-        return np.asarray(np.ascontiguousarray((whitened * self._weight).T)[self._known])
+    def add_powers(self) -> StepwiseWork[None]:
+        """Add powers of the temperature as long as they are significant."""
+        added = True
+        while added:
+            added = False
+            powers = self._shape.powers
+            trials = MAX_POWER - powers
+            for more in range(1, trials + 1):
+                yield
+                level = SIGNIFICANCE if powers + more <= CUBIC else HIGH_POWER_SIGNIFICANCE
+                shape = replace(self._shape, powers=powers + more)
+                if self._accept(shape, self._test_powers(shape, more), trials, level):
+                    added = True
+                    break
+
+    def add_lags(self) -> StepwiseWork[None]:
+        """Add lags as long as they are significant, and drop powers that are not significant beside a lag."""
+        for k in range(1, MAX_LAGS + 1):
+            if INTERVALS_PER_SQUARED_LAGS * k**2 >= int(self._means.both_known.sum()):
+                return
+            shape = yield from self._find_lag(self._shape)
+            if shape is None or not self._accept(shape, self._test_lag(shape), LAG_TRIALS, SIGNIFICANCE):
+                return
+            yield from self._drop_powers()
+
+    def fit(self) -> ThermalFit:
+        """Fit the coefficients of the selected form."""
+        means, shape, own = self._means, self._shape, self._nuisance.shape[1]
+        columns = self._columns(shape)
+        known = means.both_known
+        estimate = self._estimate(columns)
+        slopes = estimate.coefficients[own:]
+        step = float(estimate.coefficients[own - 1]) if self._since is not None else 0.0
+        bias = means.bias - (0.0 if self._since is None else step * self._nuisance[:, -1])
+        constant = float((bias - columns @ slopes)[known].mean())
+        terms = 1 + shape.powers + shape.difference_equation_order
+        sizes = np.concatenate([[constant], slopes])
+        residuals = np.where(known, bias - constant - columns @ slopes, np.nan)
+        phi, sigma = _residual_correlation(residuals, estimate.degrees_of_freedom)
+        model = ThermalModel(
+            shape=shape,
+            interval_s=means.interval_s,
+            reference_c=self._reference_c,
+            coefficients=sizes[:terms],
+            initial_state=sizes[terms:],
+            phi=phi,
+            sigma=sigma,
+            covariance=np.zeros((0, 0)),
+            lowest_c=float(np.nanmin(means.temperature_c)),
+            highest_c=float(np.nanmax(means.temperature_c)),
+        )
+        if shape.constants_s:
+            columns = np.hstack([columns, bias_derivatives_by_log_time_constant(model, self._excess, sizes)])
+            estimate = self._estimate(columns)
+        covariance = estimate.covariance[own:, own:]
+        # The constant is the mean of the bias minus the other terms.
+        centre = -columns[known].mean(axis=0)
+        whole = np.vstack([centre, np.eye(centre.size)]) @ covariance @ np.vstack([centre, np.eye(centre.size)]).T
+        whole[0, 0] += model.residual_std**2 / known.sum()
+        model = replace(model, covariance=whole)
+        explained = max(1.0 - float(np.nanvar(residuals) / np.var(bias[known])), 0.0)
+        return ThermalFit(
+            model,
+            tuple(self._tests),
+            self.temperature_rose_and_fell,
+            explained,
+            float(np.sqrt(np.nanmean(residuals**2))),
+            estimate.degrees_of_freedom,
+            min((one.p_value for one in self._tests), default=1.0),
+            step,
+            1.0 if self._since is None else self._test_step(),
+        )
+
+    def _accept(self, shape: ThermalModelForm, test: RegressorTest | None, trials: int, level: float) -> bool:
+        """Record a test, and select the tested form if it is significant."""
+        p_value = 1.0 if test is None else min(trials * test.p_value, 1.0)
+        self._tests.append(TermTest(shape, p_value))
+        if p_value < level:
+            self._shape = shape
+        return p_value < level
+
+    def _columns(self, shape: ThermalModelForm) -> Floats:
+        """Return the powers, the lags and the initial-state responses of a form [n, terms - 1 + k]."""
+        return build_regressors(shape, self._excess, self._means.interval_s, with_initial_state=True)[:, 1:]
+
+    def _test(self, nuisance: Floats, tested: Floats) -> RegressorTest | None:
+        average = self._grouping.average
+        return f_test(self._y, average(np.hstack([self._nuisance, nuisance])), average(tested), self._grouping.known)
+
+    def _estimate(self, columns: Floats) -> CoefficientEstimate:
+        found = estimate_coefficients(
+            self._y, self._grouping.average(np.hstack([self._nuisance, columns])), self._grouping.known
+        )
+        if found is None:
+            raise NotReady("too few intervals with bias and temperature for the thermal model: record longer")
+        return found
+
+    def _test_powers(self, shape: ThermalModelForm, count: int) -> RegressorTest | None:
+        """Test the highest ``count`` powers of a form."""
+        columns = self._columns(shape)
+        tested = np.arange(columns.shape[1])
+        tested = tested[(tested >= shape.powers - count) & (tested < shape.powers)]
+        return self._test(np.delete(columns, tested, axis=1), columns[:, tested])
+
+    def _test_lag(self, shape: ThermalModelForm) -> RegressorTest | None:
+        """Test the last lag of a form. The response to its initial state is part of the null hypothesis."""
+        columns, at = self._columns(shape), shape.powers + shape.difference_equation_order - 1
+        return self._test(np.delete(columns, at, axis=1), columns[:, [at]])
+
+    def _test_step(self) -> float:
+        """Return the p-value of the bias step."""
+        average = self._grouping.average
+        nuisance = np.hstack([self._nuisance[:, :-1], self._columns(self._shape)])
+        found = f_test(self._y, average(nuisance), average(self._nuisance[:, -1:]), self._grouping.known)
+        return 1.0 if found is None else found.p_value
+
+    def _find_lag(self, shape: ThermalModelForm) -> StepwiseWork[ThermalModelForm | None]:
+        """Return the form with the most likely additional lag, or None if no further time constant is possible."""
+        grid = [
+            one
+            for one in self._grid.tolist()
+            if all(max(one / c, c / one) >= MIN_TIME_CONSTANT_RATIO for c in shape.constants_s)
+        ]
+        scores = []
+        for one in grid:
+            scores.append((yield from self._likelihood(shape, one)))
+        if not grid or max(scores) == -inf:
+            return None
+        best = grid[int(np.argmax(scores))]
+        ratio = float(self._grid[1] / self._grid[0])
+        lo, hi = max(best / ratio, self._fastest), min(best * ratio, self._slowest)
+        for _ in range(GOLDEN_STEPS):
+            a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
+            below = yield from self._likelihood(shape, a)
+            above = yield from self._likelihood(shape, b)
+            lo, hi = (lo, b) if below > above else (a, hi)
+        return replace(shape, constants_s=(*shape.constants_s, (lo * hi) ** 0.5))
+
+    def _likelihood(self, shape: ThermalModelForm, constant: float) -> StepwiseWork[float]:
+        """Return the log-likelihood of a form with an additional lag."""
+        yield
+        columns = self._columns(replace(shape, constants_s=(*shape.constants_s, constant)))
+        average = self._grouping.average
+        return max_log_likelihood(self._y, average(np.hstack([self._nuisance, columns])), self._grouping.known)
+
+    def _drop_powers(self) -> StepwiseWork[None]:
+        """Drop the highest powers that are not significant beside the lags, and fit the last lag again."""
+        powers = self._shape.powers
+        while self._shape.powers:
+            yield
+            test = self._test_powers(self._shape, 1)
+            if test is not None and test.p_value < SIGNIFICANCE:
+                break
+            self._shape = replace(self._shape, powers=self._shape.powers - 1)
+        if self._shape.powers < powers:
+            again = yield from self._find_lag(replace(self._shape, constants_s=self._shape.constants_s[:-1]))
+            self._shape = again or self._shape
 
 
-def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
-    """Return the rms error with which each part of the recording is predicted by a fit to the other parts.
-
-    For the first part, the temperature before the recording is assumed to be constant, because the initial state of the
-    lags is unknown.
-    """
-    edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
-    square = 0.0
-    for lo, hi in pairwise(edges.tolist()):
-        used = means.both_known.copy()
-        used[lo:hi] = False
-        columns = one.columns if lo else build_regressors(one.shape, excess, means.interval_s)
-        whitening = Whitening(used, one.phi)
-        x, z = whitening.whiten(columns), whitening.whiten(np.where(used, means.bias, 0.0))
-        differences = (means.bias - columns @ solve_least_squares(x, z))[lo:hi]
-        square += float((differences[means.both_known[lo:hi]] ** 2).sum())
-    return float((square / means.both_known.sum()) ** 0.5)
-
-
-def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
-    """Convert a fit to a thermal model with the covariance of the coefficients."""
-    k = one.shape.difference_equation_order
-    terms = one.sizes.size - k
-    model = ThermalModel(
-        shape=one.shape,
-        interval_s=means.interval_s,
-        reference_c=reference_c,
-        coefficients=one.sizes[:terms],
-        initial_state=one.sizes[terms:],
-        phi=one.phi,
-        sigma=one.sigma,
-        covariance=np.zeros((0, 0)),
-        lowest_c=float(np.nanmin(means.temperature_c)),
-        highest_c=float(np.nanmax(means.temperature_c)),
-    )
-    rows = np.hstack([one.columns, bias_derivatives_by_log_time_constant(model, excess, one.sizes)])
-    x = Whitening(means.both_known, one.phi).whiten(rows)
-    return replace(model, covariance=coefficient_covariance(x, one.sigma))
+def _residual_correlation(residuals: Floats, degrees_of_freedom: int) -> tuple[float, float]:
+    """Return the correlation φ of successive residuals, and the standard deviation of the one-step residuals."""
+    pairs = np.array([(a, b) for a, b in pairwise(residuals.tolist())]).reshape(-1, 2)
+    before, after = pairs[np.isfinite(pairs).all(axis=1)].T
+    square = float(before @ before)
+    phi = min(max(float(before @ after) / square, 0.0), MAX_PHI) if square > 0.0 else 0.0
+    count = int(np.isfinite(residuals).sum())
+    scatter = float(np.sum((after - phi * before) ** 2)) if phi else float(np.nansum(residuals**2))
+    share = count / max(after.size if phi else count, 1)
+    return phi, max(share * scatter / max(min(degrees_of_freedom, count), 1), 1e-300) ** 0.5

@@ -12,6 +12,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.distributions import Z95
+from monitor.drift.thermal.interval_means import interpolate_missing_temperatures
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
     build_regressors,
@@ -47,11 +48,22 @@ class ThermalModel:
     @property
     def mean_bias_slope(self) -> float:
         """Return the mean change of the bias per °C, in rad/s or m/s², after all lags have settled."""
+        powers = self.shape.powers
+        return float(self.coefficients[1 : 1 + powers] @ self._chords + self.coefficients[1 + powers :].sum())
+
+    @property
+    def slope_gradient(self) -> Floats:
+        """Return the derivatives of ``mean_bias_slope`` with respect to the parameters of ``covariance``."""
+        gradient = np.zeros(self.covariance.shape[0])
+        gradient[1 : 1 + self.shape.powers] = self._chords
+        gradient[1 + self.shape.powers : self.coefficients.size] = 1.0
+        return gradient
+
+    @property
+    def _chords(self) -> Floats:
+        """Return the mean slope of each power of the temperature over the range of the fit."""
         (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
-        chords = (hi**powers - lo**powers) / (hi - lo)
-        return float(
-            self.coefficients[1 : 1 + self.shape.powers] @ chords + self.coefficients[1 + self.shape.powers :].sum()
-        )
+        return np.asarray((hi**powers - lo**powers) / (hi - lo))
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
@@ -165,27 +177,6 @@ def predict_bias_and_variance(
     return bias, variance
 
 
-def interpolate_missing_temperatures(temperature_c: Floats) -> Floats:
-    """Replace missing temperatures [n] by interpolated values."""
-    there = np.flatnonzero(np.isfinite(temperature_c))
-    return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
-
-
-def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> Floats:
-    """Return the covariance matrix [m, m] of least-squares coefficients.
-
-    Parameters
-    ----------
-    whitened_regressors : ndarray, shape (n, m)
-        Whitened regressors, as returned by ``Whitening.whiten``.
-    residual_std : float
-        Standard deviation of the whitened residuals.
-    """
-    scale = np.maximum(np.linalg.norm(whitened_regressors, axis=0), 1e-300)
-    scaled = whitened_regressors / scale
-    return np.asarray(residual_std**2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-10) / np.outer(scale, scale))
-
-
 def bias_derivatives_by_log_time_constant(model: ThermalModel, excess_c: Floats, coefficients: Floats) -> Floats:
     """Return the derivatives [n, k] of the bias with respect to the logarithms of the time constants.
 
@@ -198,47 +189,17 @@ def bias_derivatives_by_log_time_constant(model: ThermalModel, excess_c: Floats,
     coefficients : ndarray, shape (terms + k,)
         Coefficients of the regressors.
     """
-    return combine_regressor_derivatives(
-        model.shape, regressor_derivatives_by_log_time_constant(model.shape, excess_c, model.interval_s), coefficients
-    )
-
-
-def regressor_derivatives_by_log_time_constant(shape: ThermalModelForm, excess_c: Floats, interval_s: float) -> Floats:
-    """Return the derivatives of lags and initial-state responses with respect to log time constants.
-
-    Parameters
-    ----------
-    shape : ThermalModelForm
-        Form of the thermal model.
-    excess_c : ndarray, shape (n,)
-        Temperature relative to the reference temperature, °C.
-    interval_s : float
-        Length of an interval, s.
-    """
+    shape = model.shape
     less, more = (
         build_regressors(
             ThermalModelForm(0, tuple(one * np.exp(by) for one in shape.constants_s)),
             excess_c,
-            interval_s,
+            model.interval_s,
             with_initial_state=True,
         )
         for by in (-LOG_TIME_CONSTANT_STEP, LOG_TIME_CONSTANT_STEP)
     )
-    return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
-
-
-def combine_regressor_derivatives(shape: ThermalModelForm, derivatives: Floats, coefficients: Floats) -> Floats:
-    """Combine the derivatives of the regressors with the coefficients to obtain the derivatives of the bias.
-
-    Parameters
-    ----------
-    shape : ThermalModelForm
-        Form of the thermal model.
-    derivatives : ndarray, shape (n, 2 k)
-        Result of ``regressor_derivatives_by_log_time_constant``.
-    coefficients : ndarray, shape (terms + k,)
-        Coefficients of the regressors.
-    """
+    derivatives = (more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP)
     k, first = shape.difference_equation_order, 1 + shape.powers
     return np.asarray(
         derivatives[:, :k] * coefficients[first : first + k] + derivatives[:, k:] * coefficients[first + k :]

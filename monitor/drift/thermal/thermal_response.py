@@ -35,6 +35,11 @@ class ThermalModelForm:
         return len(self.constants_s)
 
     @property
+    def is_constant(self) -> bool:
+        """Return True if the bias does not depend on temperature."""
+        return not (self.powers or self.constants_s)
+
+    @property
     def name(self) -> str:
         """Return the name of the model form for display.
 

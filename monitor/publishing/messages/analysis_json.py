@@ -50,7 +50,7 @@ class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval
 
 
 class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
-    """Coefficients K and R of one axis after removal of the temperature-correlated bias."""
+    """Coefficients B, K and R of one axis after removal of the temperature-correlated bias."""
 
     model: str
     coefficients: dict[str, CoefficientValue]

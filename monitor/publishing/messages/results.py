@@ -16,7 +16,7 @@ from monitor.common import topics
 from monitor.common.control_characters import remove_control_characters
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
+from monitor.drift.thermal.residual_alarm import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate

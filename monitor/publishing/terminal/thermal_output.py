@@ -12,12 +12,12 @@ from monitor.common.unit_formatting import (
     UnitSystem,
     format_axis_value,
     format_duration,
+    format_number,
     sensor_kind,
 )
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemovalComparison
 from monitor.drift.thermal.thermal_fit import ThermalFit
-from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionErrors, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
@@ -25,6 +25,10 @@ from monitor.publishing.terminal.tables import plain_table, print_line, print_no
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
+LEGEND: Final = (
+    "constant: no dependence on temperature is significant beside the slow noise of the axis. leaves: rms of the means "
+    "minus the model."
+)
 ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor hysteresis can be determined"
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
 
@@ -43,20 +47,13 @@ def print_thermal_fit(report: ThermalFitReport, console: Console, units: UnitSys
     """
     console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
     if report.fits:
-        rows = plain_table(
-            "axis", "model", wrapped_headers=("per °C", "late by", "loop", "leaves", "explains", "validated")
-        )
+        rows = plain_table("axis", "model", "per °C", "95 % interval", "explains", "leaves")
         for axis, one in report.fits.items():
             rows.add_row(axis, *_fit_row(axis, one, units))
         console.print(Padding(rows, (1, 0)))
-        console.print(
-            "loop: largest difference between heating and cooling, if noise does not explain it. leaves: rms of the "
-            "means minus the model. validated: rms on parts of the record that are predicted from the other parts "
-            "(and its ratio to that of a cubic).",
-            style="dim",
-        )
+        console.print(LEGEND, style="dim", highlight=False)
     one_way = [axis for axis, one in report.fits.items() if not one.temperature_rose_and_fell]
-    notes = (*report.notes, *notes_on_hysteresis(report), *([ONE_WAY] if one_way else []))
+    notes = (*report.notes, *notes_on_lags_and_hysteresis(report), *([ONE_WAY] if one_way else []))
     _print_notes(report.refused, notes, console)
 
 
@@ -106,7 +103,7 @@ def notes_on_temperature_dependence(removal: TemperatureRemovalComparison) -> li
         if one.explains_most_variance:
             share_text = f"{math.floor(100.0 * one.share):d} %"
             notes.append(
-                f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
+                f"{axis} follows its temperature: {one.form} explains {share_text} of the variance of means of "
                 f"{format_duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
                 f"{'; ' + without if without else ''}; imu-monitor thermal fit models it"
                 f"{'' if not one.one_way else f' ({DRIFT_WITH_TIME})'}"
@@ -116,37 +113,47 @@ def notes_on_temperature_dependence(removal: TemperatureRemovalComparison) -> li
     return notes
 
 
-def notes_on_hysteresis(report: ThermalFitReport) -> list[str]:
-    """Return a note for each axis on which the bias differs significantly between heating and cooling."""
-    return [
-        f"{axis}: at one temperature the bias differs between heating and cooling by up to "
-        f"{format_axis_value(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
-        for axis, one in report.fits.items()
-        if one.hysteresis and one.hysteresis_p is not None
-    ]
+def notes_on_lags_and_hysteresis(report: ThermalFitReport) -> list[str]:
+    """Return a note for each lag, and for each axis whose bias differs between heating and cooling."""
+    notes = []
+    for axis, one in report.fits.items():
+        notes += [
+            f"{axis} follows its temperature with a lag of {format_duration(constant)} "
+            f"(95 % interval {format_duration(lo)} … {format_duration(hi)})"
+            for constant, (lo, hi) in zip(one.model.shape.constants_s, one.time_constant_intervals_s, strict=True)
+        ]
+        loop = one.hysteresis
+        if loop is not None and loop.is_significant:
+            notes.append(
+                f"{axis}: at one temperature the bias differs between heating and cooling by up to "
+                f"{format_axis_value(axis, loop.size)} (hysteresis or a lag, p = {loop.p_value:.1g})"
+            )
+    return notes
 
 
 def encode_thermal_fit(report: ThermalFitReport) -> bytes:
     """Encode the results of a thermal model fit as JSON, in SI units."""
     axes: dict[str, Any] = {}
     for axis, one in report.fits.items():
-        model = one.model
+        model, loop = one.model, one.hysteresis
         axes[axis] = {
             "model": model.shape.name,
             "reference": model.reference_c,
             "sizes": model.coefficients.tolist(),
             "time_constants": list(model.shape.constants_s),
             "equation": model.equation,
+            "sizes_interval": _coefficient_intervals(one),
+            "time_constants_interval": one.time_constant_intervals_s,
             "slope": model.mean_bias_slope,
-            "hysteresis": one.hysteresis,
-            "hysteresis_p": one.hysteresis_p,
+            "slope_interval": one.slope_interval,
+            "p_value": one.p_value,
+            "hysteresis": loop and (loop.size if loop.is_significant else 0.0),
+            "hysteresis_p": loop and loop.p_value,
             "both_directions": one.temperature_rose_and_fell,
             "explained": one.explained,
             "phi": model.phi,
-            "candidates": [
-                {"model": each.shape.name, "aicc": each.aicc, "rms": each.rms, "validated": each.validated}
-                for each in one.candidates
-            ],
+            "rms": one.rms,
+            "tests": [{"model": each.shape.name, "p_value": each.p_value} for each in one.tests],
             "temperature": report.means[axis].temperature_c,
             "bias": report.means[axis].bias,
             "error": report.means[axis].error,
@@ -197,17 +204,24 @@ def _summary_line(recording: str, interval_s: float, means: Any) -> str:
     return f"{recording}: {count} intervals of {format_duration(interval_s)}, {span}"
 
 
+def _coefficient_intervals(one: ThermalFit) -> Any:
+    """Return the 95 % interval of each coefficient [terms, 2]."""
+    sizes = one.model.coefficients
+    half = one.half_widths(np.eye(one.model.covariance.shape[0])[: sizes.size])
+    return np.stack([sizes - half, sizes + half], axis=1)
+
+
 def _fit_row(axis: str, one: ThermalFit, units: UnitSystem) -> tuple[str, ...]:
-    model, best = one.model, one.candidates[0]
-    cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
+    model, leaves = one.model, _format_deviation(axis, one.rms, units)
+    if model.shape.is_constant:
+        return (model.shape.name, "—", "—", "—", leaves)
+    factor = units.deviation(sensor_kind(axis)).factor
     return (
         model.shape.name,
-        _format_deviation(axis, model.mean_bias_slope, units) if model.shape != ThermalModelForm(0, ()) else "—",
-        ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
-        "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis, units),
-        _format_deviation(axis, best.rms, units),
+        _format_deviation(axis, model.mean_bias_slope, units),
+        " … ".join(format_number(factor * each) for each in one.slope_interval),
         f"{100.0 * one.explained:z.0f} %",
-        _format_deviation(axis, best.validated, units) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
+        leaves,
     )
 
 

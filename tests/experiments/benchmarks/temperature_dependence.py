@@ -11,7 +11,9 @@ import argparse
 
 import numpy as np
 
-from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, find_temperature_dependence
+from monitor.drift.thermal.hysteresis import find_hysteresis
+from monitor.drift.thermal.temperature_removal import find_temperature_dependence
+from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from tests.experiments.benchmarks.machine import console, create_table
 from tests.monitor.drift.temperature_cycles import NOISES, SHAPES, simulate_chamber_means, simulate_noise_means
 
@@ -25,11 +27,12 @@ def count_false_alarms(noise: str, shape: str, seeds: int) -> tuple[int, int, in
     found = np.zeros(3, int)
     for seed in range(seeds):
         means = simulate_chamber_means(shape, simulate_noise_means(noise, COUNT, np.random.default_rng(seed)))
-        dependence, loop = find_temperature_dependence(means), find_hysteresis(means)
+        fit = fit_thermal_model(means)
+        dependence, loop = find_temperature_dependence(fit), fit.hysteresis
         found += (
             dependence is not None,
             dependence is not None and dependence.explains_most_variance,
-            loop is not None and loop.hysteresis_is_significant,
+            loop is not None and loop.is_significant,
         )
     return int(found[0]), int(found[1]), int(found[2])
 
@@ -40,7 +43,7 @@ def count_detections(law: str, shape: str, share: float, seeds: int) -> int:
     for seed in range(seeds):
         noise = simulate_noise_means("random walk", COUNT, np.random.default_rng(seed))
         size = noise.std() * (share / (1.0 - share)) ** 0.5
-        dependence = find_temperature_dependence(simulate_chamber_means(shape, noise, law, size))
+        dependence = find_temperature_dependence(fit_thermal_model(simulate_chamber_means(shape, noise, law, size)))
         found += dependence is not None and dependence.explains_most_variance
     return found
 
@@ -52,7 +55,7 @@ def count_loops(law: str, shape: str, size: float, seeds: int) -> tuple[int, flo
         noise = simulate_noise_means("white", COUNT, np.random.default_rng(seed))
         curve = simulate_chamber_means(shape, noise, "cubic", 100.0).bias
         loop = find_hysteresis(simulate_chamber_means(shape, curve, law, size))
-        if loop is not None and loop.hysteresis_is_significant:
+        if loop is not None and loop.is_significant:
             ratios.append(loop.size / size)
     return len(ratios), float(np.median(ratios)) if ratios else float("nan")
 

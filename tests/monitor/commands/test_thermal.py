@@ -48,6 +48,44 @@ def test_model_of_one_recording_predicts_another(tmp_path, capsys):
     assert prediction["rms_offset_out"] < 0.2 * prediction["rms_alone"]
 
 
+def test_table_fits_eighty_columns_and_names_what_is_constant(tmp_path, capsys, monkeypatch):
+    """gx follows its temperature beside a random walk, gy is a random walk, and az follows with a lag."""
+    rng = np.random.default_rng(5)
+    n = 7200
+    t = np.arange(n)
+    temperature_c = 25.0 + 3.0 * np.sin(2.0 * np.pi * t / 1800.0)
+    walks = 1e-4 / n**0.5 * rng.standard_normal((3, n)).cumsum(axis=1) + 2e-5 * rng.standard_normal((3, n))
+    lagged, level = np.empty(n), 25.0
+    for k in range(n):
+        level += (temperature_c[k] - level) / 300.0
+        lagged[k] = level
+    path = tmp_path / "x.npz"
+    np.savez(
+        path,
+        fs=1.0,
+        temp=temperature_c,
+        gx=walks[0] - 5e-5 * temperature_c,
+        gy=walks[1],
+        az=9.81 + walks[2] + 1e-2 * lagged,
+    )
+    monkeypatch.setenv("COLUMNS", "80")
+    assert exit_status("thermal", "fit", path, "--json", tmp_path / "out.json") == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split()[0]: line for line in lines if line[:2] in ("gx", "gy", "az") and "note" not in line}
+    assert all(len(line.rstrip()) <= 80 for line in rows.values())
+    assert rows["gx"].startswith("gx    polynomial 1")
+    assert " … " in rows["gx"]
+    assert rows["gy"].split()[1:5] == ["constant", "—", "—", "—"]
+    assert rows["az"].startswith("az    difference")
+    assert any(line.startswith("note: az follows its temperature with a lag of ") for line in lines)
+    axes = json.loads((tmp_path / "out.json").read_bytes())["axes"]
+    assert axes["gx"]["slope_interval"][0] < -5e-5 < axes["gx"]["slope_interval"][1]
+    assert axes["gx"]["sizes_interval"][1] == pytest.approx(axes["gx"]["slope_interval"])
+    assert len(axes["az"]["time_constants_interval"]) == len(axes["az"]["time_constants"])
+    assert axes["gy"]["slope"] == 0.0
+    assert axes["gy"]["p_value"] > 0.02
+
+
 def test_model_file_preserves_all_parameters(tmp_path):
     study = thermal.fit_thermal_models(write_recording(tmp_path / "a.npz", 3), 3600.0)
     path = tmp_path / "m.json"

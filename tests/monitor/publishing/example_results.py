@@ -8,7 +8,7 @@ from drivers.data_types import AXES
 from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
-from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
+from monitor.drift.thermal.residual_alarm import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.total import compute_total_curve

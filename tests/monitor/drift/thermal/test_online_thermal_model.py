@@ -163,3 +163,15 @@ def test_history_is_bounded():
     for _ in range(MAX_INTERVALS + 100):
         model_under_test.predict_and_add_interval(0.0, 1e-7, 25.0)
     assert len(model_under_test._rows) == MAX_INTERVALS
+
+
+def test_random_walk_gives_a_constant_model():
+    """The temperature has a daily cycle, and the bias is white noise and a random walk."""
+    for seed in range(3):
+        rng = np.random.default_rng([11, seed])
+        temperature_c = simulate_hourly_means(seed, 0, 0.0).temperature_c
+        bias = 1e-6 * (rng.standard_normal(72) + rng.standard_normal(72).cumsum())
+        run = ModelRun().add_intervals(bias, temperature_c)
+        assert {result.model for result in run.results[12:]} == {"constant"}
+        assert run.results[-1].slope == 0.0
+        assert not any(run.found)

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.drift.thermal.residual_alarm import MIN_OUTSIDE, WINDOW_INTERVALS, UnexplainedBiasChangeDetector
+from monitor.drift.thermal.residual_alarm import (
+    MIN_OUTSIDE,
+    WINDOW_INTERVALS,
+    PredictionInterval,
+    UnexplainedBiasChangeDetector,
+)
 
 MULTI, ONE = PredictionInterval(0.0, -3.0, 3.0), PredictionInterval(1.0, -1.0, 3.0)
 

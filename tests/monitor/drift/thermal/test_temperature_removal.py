@@ -51,7 +51,7 @@ def test_temperature_effect_is_removed_and_other_drift_stays(analysis_and_temper
     assert "gy" not in found.dependences
     assert found.axes_explained_by_temperature == ("gx",)
     (note,) = notes_on_temperature_dependence(found)
-    assert note.startswith("gx follows its temperature: a cubic explains ")
+    assert note.startswith("gx follows its temperature: polynomial 1 explains ")
     assert "without temperature (polynomial 1), K falls from " in note
 
 

@@ -1,13 +1,9 @@
-"""Tests of the thermal model: difference equation, derivatives and covariance."""
+"""Tests of the thermal model: difference equation and derivatives."""
 
 import numpy as np
 import pytest
 
-from monitor.drift.thermal.thermal_model import (
-    ThermalModel,
-    bias_derivatives_by_log_time_constant,
-    coefficient_covariance,
-)
+from monitor.drift.thermal.thermal_model import ThermalModel, bias_derivatives_by_log_time_constant
 from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 TEMPERATURE_SERIES = np.random.default_rng(5).standard_normal(40).cumsum()
@@ -40,8 +36,3 @@ def test_derivatives_by_time_constant_equal_finite_differences():
     )
     want = np.stack([(compute_bias(at, 1e-5) - compute_bias(at, -1e-5)) / 2e-5 for at in (0, 1)], axis=1)
     np.testing.assert_allclose(found, want, rtol=1e-4, atol=1e-5)
-
-
-def test_covariance_is_that_of_least_squares():
-    rows = np.random.default_rng(6).standard_normal((50, 3)) * [1.0, 1e-4, 1e5]
-    np.testing.assert_allclose(coefficient_covariance(rows, 2.0), 4.0 * np.linalg.inv(rows.T @ rows), rtol=1e-6)

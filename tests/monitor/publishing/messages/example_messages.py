@@ -6,11 +6,10 @@ import numpy as np
 
 from drivers.data_types import Event
 from monitor.common.device_health import Health
-from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
-from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
-from monitor.drift.thermal.temperature_removal import TemperatureRemovalComparison
+from monitor.drift.thermal.residual_alarm import PredictionInterval
+from monitor.drift.thermal.temperature_removal import TemperatureDependence, TemperatureRemovalComparison
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import RecordingAnalysis
