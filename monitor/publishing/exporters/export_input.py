@@ -75,7 +75,7 @@ class NoiseCoefficients:
     source: str  # source of the coefficients, for the header of the file
     left_out: tuple[str, ...] = ()  # effects that no coefficient represents, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
-    warnings: tuple[str, ...] = ()  # ASCII warnings for the header of the file
+    remarks: tuple[str, ...] = ()  # ASCII remarks for the header of the file
 
     def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, AxisCoefficientOrBound]:
         """Return the noise coefficient with the given symbol for each axis on which it is known.
@@ -131,9 +131,15 @@ class _Temperature(msgspec.Struct):
     share: float
 
 
+class _WithoutTemperature(msgspec.Struct):
+    model: str
+    coefficients: dict[str, _Coefficient]
+
+
 class _Axis(msgspec.Struct):
     coefficients: dict[str, _Coefficient]
     temperature: _Temperature | None = None
+    without_temperature: _WithoutTemperature | None = None
 
 
 class _Schema(msgspec.Struct):
@@ -188,20 +194,42 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
     except ConfigError as error:
         raise ConfigError(f"rate: {error}") from None
     axes: dict[str, dict[str, AxisCoefficientOrBound]] = {}
+    remarks: list[str] = []
     for axis in (axis for axis in AXES if axis in found.axes):
-        for letter, one in found.axes[axis].coefficients.items():
-            if one.status == "estimated" and one.value is not None:
-                interval = None if one.lo is None or one.hi is None else (one.lo, one.hi)
-                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.value, interval=interval)
-            elif one.status == "upper_bound" and one.hi is not None:
-                axes.setdefault(axis, {})[letter] = AxisCoefficientOrBound(one.hi, bound=True)
-    warnings = tuple(
-        f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
-        f"B and K of {axis} describe temperature as well as noise"
-        for axis in axes
-        if (mark := found.axes[axis].temperature) is not None
-    )
-    return NoiseCoefficients(axes, found.rate, source, measured=True, warnings=warnings)
+        one = found.axes[axis]
+        terms, without = _known_coefficients(one.coefficients), one.without_temperature
+        corrected = {} if without is None else _known_coefficients(without.coefficients)
+        if terms or corrected:
+            axes[axis] = terms | corrected
+        if without is not None and corrected:
+            remarks.append(
+                f"{axis} follows its temperature: {_join_letters(corrected)} of {axis} without its effect "
+                f"({without.model})"
+            )
+        affected = [letter for letter in "BK" if letter in terms and letter not in corrected]
+        if one.temperature is not None and affected:
+            share = math.floor(100.0 * one.temperature.share)
+            remarks.append(
+                f"WARNING: {axis} follows its temperature, which explains {share:d} % of its slow variance and is part "
+                f"of {_join_letters(affected)} of {axis}"
+            )
+    return NoiseCoefficients(axes, found.rate, source, measured=True, remarks=tuple(remarks))
+
+
+def _known_coefficients(coefficients: Mapping[str, _Coefficient]) -> dict[str, AxisCoefficientOrBound]:
+    """Return the coefficients that are estimated or bounded."""
+    known = {}
+    for letter, one in coefficients.items():
+        if one.status == "estimated" and one.value is not None:
+            interval = None if one.lo is None or one.hi is None else (one.lo, one.hi)
+            known[letter] = AxisCoefficientOrBound(one.value, interval=interval)
+        elif one.status == "upper_bound" and one.hi is not None:
+            known[letter] = AxisCoefficientOrBound(one.hi, bound=True)
+    return known
+
+
+def _join_letters(letters: Collection[str]) -> str:
+    return " and ".join(", ".join(letters).rsplit(", ", 1))
 
 
 def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuError:
@@ -318,7 +346,7 @@ def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: st
     return [
         f"{comment_sign} source: {source}",
         f"{comment_sign} inflation: {done}",
-        *(f"{comment_sign} WARNING: {one}" for one in noise.warnings),
+        *(f"{comment_sign} {one}" for one in noise.remarks),
     ]
 
 

@@ -309,6 +309,44 @@ def test_temperature_dependent_axis_gives_a_warning(form: str) -> None:
     mark = "%" if form == "gyroparams" else "#"
     [line] = [line for line in exported.splitlines() if "WARNING" in line]
     assert line == (
-        f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance: "
-        "B and K of gy describe temperature as well as noise"
+        f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance "
+        "and is part of B and K of gy"
     )
+
+
+@pytest.mark.parametrize(
+    ("k", "k_text"),
+    [
+        (
+            {"value": 2e-6, "lo": 1.8e-6, "hi": 2.2e-6, "status": "estimated"},
+            "2e-06 (95 % interval 1.8e-06 to 2.2e-06)",
+        ),
+        ({"value": None, "lo": None, "hi": 2.9e-6, "status": "upper_bound"}, "<= 2.9e-06 (one-sided 95 % bound)"),
+        ({"value": None, "lo": None, "hi": None, "status": "unestimated"}, "8.8e-06 (95 % interval 8e-06 to 9e-06)"),
+    ],
+)
+def test_coefficients_without_temperature_are_exported(k: dict[str, Any], k_text: str) -> None:
+    """K with temperature is exported only if K without temperature is unknown."""
+    own = {
+        "N": {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"},
+        "K": {"value": 8.8e-6, "lo": 8e-6, "hi": 9e-6, "status": "estimated"},
+    }
+    gx = {
+        "coefficients": own,
+        "temperature": {"share": 0.987},
+        "without_temperature": {"model": "polynomial 1", "coefficients": {"K": k}, "share": {"K": 0.9}},
+    }
+    axes = {"gx": gx, "ax": {"coefficients": own}}
+    text = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
+    lines = exporters.export(exporters.from_analysis_json(text), "kalibr").splitlines()
+    value = 8.8e-6 if k["status"] == "unestimated" else k["value"] or k["hi"]
+    [line] = [line for line in lines if line.startswith("gyroscope_random_walk")]
+    assert float(line.split()[1]) == value
+    assert any(k_text in line for line in lines)
+    remarks = [line for line in lines if "follows its temperature" in line]
+    if k["status"] == "unestimated":
+        assert len(remarks) == 1
+        assert remarks[0].startswith("# WARNING: gx follows its temperature")
+        assert remarks[0].endswith("is part of K of gx")
+    else:
+        assert remarks == ["# gx follows its temperature: K of gx without its effect (polynomial 1)"]
