@@ -10,7 +10,7 @@ with the mean periodogram since the last change, which is the reference.
 - **Large lines** also raise an alarm of the change detector, within a second. The periodogram of the samples since the
   alarm then shows whether a line explains the change.
 - **A line** is a peak that exceeds the bins on both sides and contains most of the power above them. A step of the
-  noise level, a random walk and a wide resonance are not lines.
+  noise level, a random walk and a wide resonance are not lines. A line whose frequency drifts has not begun.
 """
 
 from dataclasses import dataclass
@@ -58,6 +58,12 @@ MIN_POWER_BEFORE: Final = 0.05
 """Minimum ratio of the power of a line before a rise to that after the rise, if the line did not begin."""
 MAX_POWER_BEFORE: Final = 0.6
 """Maximum ratio of the power of a line before and after a rise, and after and before a fall."""
+
+MAX_MOVED_POWER: Final = 0.25
+"""Maximum ratio of the power that other lines within ``LEVEL_BINS`` bins have lost to the power of a line that begins.
+
+A line whose frequency drifts loses its power at the earlier frequencies.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +218,10 @@ class LineOnsetDetector:
         around = float(np.maximum(high[outer] - beside, 0.0).sum()) if beside else power
         before = float((low[inner] - beside).sum()) if low[inner].max() > MIN_PEAK_RATIO * beside else 0.0
         if not power > MIN_CONCENTRATION * around or before > MAX_POWER_BEFORE * power:
+            return None
+        wide = slice(max(top - LEVEL_BINS, 0), top + LEVEL_BINS + 1)
+        lines = low[wide] > MIN_PEAK_RATIO * np.median(low[wide]) / MEDIAN
+        if np.maximum(low[wide] - high[wide], 0.0)[lines].sum() > MAX_MOVED_POWER * power:
             return None
         if near is None and power - before < MIN_SHARE * float((high - low)[FIRST_BIN:].sum()):
             return None

@@ -81,6 +81,14 @@ def test_random_walk_and_resonances_are_not_lines():
     assert not [change.text for change in find_changes(values, 20_000) if "line" in change.text]
 
 
+def test_line_whose_frequency_wanders_does_not_begin_again():
+    values = simulate_noise(1200)
+    seconds = np.arange(len(values)) / RATE_HZ
+    frequency_hz = 21.3 + 0.3 * np.sin(2 * np.pi * seconds / 7.0) - np.clip((seconds - 600.0) / 60.0, 0.0, 2.0)
+    values[:, 2] += 2.0 * SIGMA * np.sin(2 * np.pi * np.cumsum(frequency_hz) / RATE_HZ)
+    assert not [change.text for change in find_changes(values, 20_000) if "began" in change.text]
+
+
 @pytest.mark.long
 def test_constant_noise_gives_no_line():
     """Six hours of noise with Q, N, B and K; the accepted rate of 0.0033 lines a day gives 8e-4 lines."""
