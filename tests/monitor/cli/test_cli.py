@@ -1161,10 +1161,10 @@ import sys
 import threading
 import monitor.commands.analyze as offline
 from monitor.cli import main
-def report_start(values, rate_hz, window_s, tau, progress):
+def report_start(*values, **options):
     print("working", file=sys.stderr, flush=True)
     from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
-    return compute_dynamic_allan(values, rate_hz, window_s, tau, progress=progress)
+    return compute_dynamic_allan(*values, **options)
 offline.compute_dynamic_allan = report_start
 main()
 """
