@@ -119,7 +119,12 @@ def make_block(
 
 @dataclass(frozen=True, slots=True)
 class ArrivalTimedFormat:
-    """Wire format without a device counter. A regression estimates the sample times from the arrival times."""
+    """Wire format without a device counter. A regression estimates the sample times from the arrival times.
+
+    If ``answers_requests`` is True, each frame answers a request of the host, so each rejected frame was a sample.
+    """
+
+    answers_requests: bool = False
 
 
 @dataclass(frozen=True, slots=True)

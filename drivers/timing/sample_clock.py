@@ -15,7 +15,16 @@ from typing import Final
 
 import numpy as np
 
-from drivers.data_types import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
+from drivers.data_types import (
+    NO_TICK,
+    ArrivalTimedFormat,
+    CounterTimedFormat,
+    Event,
+    Ints,
+    SampleBlock,
+    SenderTimedFormat,
+    Timing,
+)
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
 from drivers.timing.arrival_timeline import (
     MAX_RATE_HZ,
@@ -69,6 +78,7 @@ class SampleClock:
         self._events = EventRateLimiter()
         self._rows = RowFilter(timing, self._events)
         self._timeline = ArrivalTimeline(rate_hz, isinstance(timing, CounterTimedFormat))
+        self._answers_requests = isinstance(timing, ArrivalTimedFormat) and timing.answers_requests
         self._counter: CounterGaps | None = None
         self._sender: SenderTimeGapDetector | None = None
         if isinstance(timing, CounterTimedFormat):
@@ -278,7 +288,9 @@ class SampleClock:
         timeline, n = self._timeline, len(samples)
         missing = np.zeros(n, np.int64)
         arrived_ns = int(samples.t_ns[-1])
-        rejected = timeline.count_rejected_samples(arrived_ns, n, samples.lost)
+        rejected = samples.lost
+        if not self._answers_requests:
+            rejected = timeline.count_rejected_samples(arrived_ns, n, rejected)
         if self._paused:
             missing[0] = timeline.count_missing_since_arrival(arrived_ns, n)
             timeline.forget_delay()

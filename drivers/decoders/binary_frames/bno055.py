@@ -72,7 +72,7 @@ class Settings(SettingsModel):
 class Bno055Decoder(base.FrameStreamDecoder):
     """Decoder and encoder of answers with the registers 0x00 to 0x3B."""
 
-    timing: Timing = ArrivalTimedFormat()
+    timing: Timing = ArrivalTimedFormat(answers_requests=True)
 
     def __init__(self) -> None:
         super().__init__(b"", _match_answer, MAX_ERROR_BYTES + LENGTH, ERROR + HEADER[:1])

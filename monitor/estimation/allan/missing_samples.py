@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled, inlined
+from monitor.common.compiled import inlined
 
 MIN_PRESENT_SHARE: Final = 0.7
 """Minimum share of samples that must be present to compute a slope of the rate."""
@@ -110,7 +110,7 @@ def _weights_of_grid(m: Floats) -> Floats:
     return np.stack([np.interp(log_m, log_octaves, column) for column in within.T])
 
 
-@compiled
+@inlined
 def subtract_excess(
     factors: Ints, order: Ints, first: Ints, weights: Floats, share: Floats, avar: Floats, excess: Floats
 ) -> None:
@@ -149,7 +149,7 @@ def subtract_excess(
                 within[r] += weights[p, r] * known
 
 
-@compiled
+@inlined
 def _white_noise_level(factors: Ints, order: Ints, first: Ints, avar: Floats, p: int) -> float:
     """Return the Allan variance at position p that white noise would have, from the next known value of the grid."""
     for q in range(p + 1, order.size):

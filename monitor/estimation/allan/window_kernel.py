@@ -588,7 +588,7 @@ def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints, excess: F
             avar[i, axis], terms[i, axis], excess[i, axis] = level[i], w.terms[i * LANES + axis], subtracted[i]
 
 
-@compiled
+@inlined
 def compute_variances_of_axis(
     w: WindowArrays, axis: int, rows: int, avar: Floats, excess: Floats, share: Floats
 ) -> None:

@@ -162,7 +162,8 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
-    element = re.sub(r'<g id="[^"]*"', "<g", element)  # no element refers to these identifiers
+    # No element refers to these identifiers, and equal images have the same one.
+    element = re.sub(r'(<g|<image[^>]*?) id="[^"]*"', r"\1", element)
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
     element = re.sub(r"\n(?:L )?\s*", " ", element)  # in an SVG path, coordinates without a letter continue a line
     prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on the same page need different identifiers
