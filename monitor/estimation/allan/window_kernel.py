@@ -285,9 +285,9 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 
 
 @inlined
-def missing_between(missing: NDArray[np.int32], newer: int | np.uintp, older: int | np.uintp) -> int:
-    """Return the number of missing samples between two elements of the running count, which wraps around."""
-    return int(np.int32(missing[newer] - missing[older]))
+def missing_between(newer: np.int32, older: np.int32) -> int:
+    """Return the difference of two elements of the running count of missing samples, which wraps around."""
+    return int(np.int32(newer - older))
 
 
 @compiled
@@ -316,7 +316,7 @@ def _replace_incomplete(
     for row in range(rows):
         i0, i1, i2 = np.uintp(at0 + row) * lanes, np.uintp(at1 + row) * lanes, np.uintp(at2 + row) * lanes
         out = np.uintp(row) * lanes
-        a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
+        a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
         if _all_axes_lack(missing, i0, i1, i2, a, b):
             if a == 0 and b == 0:
                 shared_terms += step
@@ -339,8 +339,8 @@ def _replace_incomplete(
                 squares[out + lane] = d * d
             continue
         for lane in range(np.uintp(AXES)):
-            a = missing_between(missing, i1 + lane, i2 + lane)
-            b = missing_between(missing, i0 + lane, i1 + lane)
+            a = missing_between(missing[i1 + lane], missing[i2 + lane])
+            b = missing_between(missing[i0 + lane], missing[i1 + lane])
             if a > most or b > most:
                 squares[out + lane] = 0.0
                 continue
@@ -366,8 +366,8 @@ def _all_axes_lack(
     """Return True if the same numbers of samples are missing in the two clusters on all axes."""
     differs = 0
     for lane in range(np.uintp(1), np.uintp(AXES)):
-        differs |= missing_between(missing, i1 + lane, i2 + lane) ^ older
-        differs |= missing_between(missing, i0 + lane, i1 + lane) ^ newer
+        differs |= missing_between(missing[i1 + lane], missing[i2 + lane]) ^ older
+        differs |= missing_between(missing[i0 + lane], missing[i1 + lane]) ^ newer
     return differs == 0
 
 
@@ -475,7 +475,7 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
         at = w.state[NEWEST] - back
         i0, i1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
         i2 = ring_row(at - 2 * m, places) * LANES + axis
-        a, b = missing_between(missing, i1, i2), missing_between(missing, i0, i1)
+        a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
         if a > most or b > most:
             continue
         d = float(phase[i0] - 2 * phase[i1] + phase[i2])
@@ -496,7 +496,7 @@ def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: in
     """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing."""
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - min(n, LEVEL), places) * LANES + axis
-    present = min(n, LEVEL) - missing_between(missing, last, first)
+    present = min(n, LEVEL) - missing_between(missing[last], missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
@@ -528,10 +528,13 @@ def integer_slope_from_thirds(phase: Ints, missing: NDArray[np.int32], newest: i
         return np.nan
     at0, at1 = newest * LANES + axis, ring_row(newest - third, places) * LANES + axis
     at2, at3 = ring_row(newest - 2 * third, places) * LANES + axis, ring_row(newest - 3 * third, places) * LANES + axis
-    late, early = third - missing_between(missing, at0, at1), third - missing_between(missing, at2, at3)
+    late, early = (
+        third - missing_between(missing[at0], missing[at1]),
+        third - missing_between(missing[at2], missing[at3]),
+    )
     if (
         min(late, early) < MIN_PRESENT_SHARE * third
-        or 3 * third - missing_between(missing, at0, at3) < MIN_PRESENT_SHARE * 3 * third
+        or 3 * third - missing_between(missing[at0], missing[at3]) < MIN_PRESENT_SHARE * 3 * third
     ):
         return np.nan
     # Phase wraps modulo 2⁶⁴, so the small difference is computed before the conversion to floating point.
@@ -581,7 +584,8 @@ def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints, excess: F
         Output array for the contributions of missing samples, which have been subtracted.
     """
     w = compiled_view_window_arrays(memory, taus)
-    level, subtracted, share = np.empty((3, taus))
+    work = np.empty((3, taus))
+    level, subtracted, share = work[0], work[1], work[2]
     for axis in range(AXES):
         compute_variances_of_axis(w, axis, taus, level, subtracted, share)
         for i in range(taus):
@@ -660,7 +664,7 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, ring_row(newest - n, places) * LANES + axis
-    if n < 2 * m or n - missing_between(missing, last, first) < MIN_PRESENT_SHARE * n:
+    if n < 2 * m or n - missing_between(missing[last], missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride, has_gaps = max(1, m // BEND_POINTS), missing[last] != missing[first]
     most, total, points = m - min_present(m), 0.0, 0
@@ -669,7 +673,7 @@ def mean_rate_slope(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
         at2 = ring_row(newest - n + 2 * m - 1 - k, places) * LANES + axis
         at3 = ring_row(newest - n + m - 1 - k, places) * LANES + axis
         if has_gaps:
-            a, b = missing_between(missing, at2, at3), missing_between(missing, at0, at1)
+            a, b = missing_between(missing[at2], missing[at3]), missing_between(missing[at0], missing[at1])
             if a > most or b > most:
                 continue
             change = m * difference_of_means(

@@ -242,7 +242,8 @@ def _follow(
 def _copy_curve(
     w: WindowArrays, grid: int, scale: SumsToVariances, curves: VariancesAndSlopesOfAxes, axis: int, length: int
 ) -> None:
-    avar, excess, share = np.empty((3, w.factors.size))
+    work = np.empty((3, w.factors.size))
+    avar, excess, share = work[0], work[1], work[2]
     compute_variances_of_axis(w, axis, grid, avar, excess, share)
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
