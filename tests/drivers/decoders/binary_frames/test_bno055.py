@@ -48,7 +48,7 @@ def test_default_units() -> None:
     got = decode_one(make_answer())
     np.testing.assert_allclose(got.values[0], [DEGREE, -10 * DEGREE, 100 * DEGREE, -0.12, 0.03, 9.81], rtol=1e-14)
     assert (got.temperature_c.tolist(), got.t_ns.tolist()) == ([25.0], [77])
-    assert build(Settings()).timing == ArrivalTimedFormat()
+    assert build(Settings()).timing == ArrivalTimedFormat(answers_requests=True)
 
 
 def test_units_of_each_answer_are_read_from_unit_sel() -> None:
