@@ -136,7 +136,7 @@ def remove_temperature_effect(
         if dependence is None:
             continue
         dependences[axis], model = dependence, found.model
-        if found.explained > 0.0:
+        if not model.shape.is_constant:
             values = values.copy() if values is analysis.values else values
             course = predict_interval_means(model, means.temperature_c, starts_with_fit=True).bias
             values[:, at] -= interpolate_with_zero_mean(course, round(means.interval_s * rate_hz), len(values))

@@ -7,6 +7,7 @@ least-squares regression finds it significant beside the slow noise of the axis 
    together with the following ones.
 2. If the temperature rose and fell, first-order lags are added one by one. The time constant comes from a search, for
    which the p-value is corrected. Powers that are not significant beside the lag are dropped again.
+3. The terms are kept only if they reduce the variance of the interval means. Otherwise, the constant predicts better.
 
 If the temperature rose and fell, a linear drift of the bias with time is part of the null hypothesis. If the
 temperature only rose or only fell, a drift with time cannot be distinguished from a dependence on temperature.
@@ -179,7 +180,11 @@ def fit_thermal_model_stepwise(
     yield from search.add_powers()
     if search.temperature_rose_and_fell or always_try_lags:
         yield from search.add_lags()
-    return search.fit()
+    found = search.fit()
+    if not found.explained > 0.0:  # a significant term beside a strong random walk may still predict worse than none
+        search.select_constant()
+        found = search.fit()
+    return found
 
 
 def refit_coefficients(model: ThermalModel, means: IntervalMeans) -> ThermalFit:
@@ -268,6 +273,10 @@ class _FormSearch:
             if shape is None or not self._accept(shape, self._test_lag(shape), LAG_TRIALS, SIGNIFICANCE):
                 return
             yield from self._drop_powers()
+
+    def select_constant(self) -> None:
+        """Select the form of a bias that does not depend on temperature."""
+        self._shape = CONSTANT
 
     def fit(self) -> ThermalFit:
         """Fit the coefficients of the selected form."""

@@ -210,6 +210,19 @@ def test_slope_beside_a_random_walk_lies_in_its_interval(kind: str) -> None:
     assert lags <= 5
 
 
+def test_model_that_explains_nothing_is_replaced_by_a_constant():
+    """The increments follow the temperature, but the random walk moves the bias the other way."""
+    t = np.linspace(0.0, 1.0, 120)
+    rng = np.random.default_rng(1)
+    temperature_c = 25.0 + 5.0 * t + np.repeat(rng.uniform(-0.5, 0.5, 24), 5)
+    bias = temperature_c - 12.0 * t + 0.01 * rng.standard_normal(120) + 0.05 * rng.standard_normal(120).cumsum()
+    found = fit_thermal_model(IntervalMeans(60.0, bias, np.full(120, 0.01), temperature_c))
+    assert found.tests[0].shape == ThermalModelForm(1, ())
+    assert found.tests[0].p_value < 1e-9
+    assert found.model.shape == ThermalModelForm(0, ())
+    assert found.model.mean_bias_slope == 0.0
+
+
 def test_bias_independent_of_temperature_gives_a_constant():
     means = simulate_hourly_means(8, 0, 0.01)
     noise = 1e-6 * np.random.default_rng(9).standard_normal(72)
