@@ -21,7 +21,7 @@ import numpy as np
 from drivers.data_types import AXES, NS_PER_S, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
-from drivers.links.base import DropCountingLink, Link
+from drivers.links.base import DropCountingLink, Link, PolledLink
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
@@ -233,6 +233,8 @@ class Driver:
         self._last_data_s = time.monotonic()
         if self._keep is not None:
             self._keep(chunks)
+        if isinstance(self.link, DropCountingLink):
+            self.clock.note_dropped_data(self.link.dropped_datagrams)
         samples = self.decoder.feed(chunks)
         if not samples:
             self._check_undecoded(b"".join(chunk.data for chunk in chunks))
@@ -247,6 +249,8 @@ class Driver:
                 self._count_samples(stamped, dropped)
                 self._push(self._axes.map_axes(stamped))
                 dropped = 0  # the dropped samples are missing only before the first block
+        if isinstance(self.link, PolledLink) and not self.times_are_unix:
+            self.clock.note_end_of_backlog(self.link.empty_ns)
         self._count_decoder_drops()
         if false_losses := self.clock.take_false_losses():
             self.counts.lost = max(self.counts.lost - false_losses, 0)

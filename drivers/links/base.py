@@ -79,13 +79,14 @@ class PolledLink(ABC):
         self.name = name
         self._closing = threading.Event()
         self._in_use = threading.Lock()
-        self._empty_ns = 0  # newest monotonic time at which the source is known to have held no unread data
+        self.empty_ns = 0
+        """Newest monotonic time in ns at which the source is known to have held no unread data."""
 
     def open(self) -> None:
         """Open the source if the source is closed. Raise ``LinkUnavailable`` if opening fails."""
         with self._in_use:
             if not self._is_open():
-                self._empty_ns = time.monotonic_ns()
+                self.empty_ns = time.monotonic_ns()
                 self._open_source()
                 self._closing.clear()
 

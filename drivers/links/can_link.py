@@ -201,7 +201,7 @@ class CanLink(PolledLink):
                 f"{self.name}: the bus is gone (interface down or adapter unplugged): {describe_error(reason)}"
             ) from error
         if message is None:
-            self._empty_ns = asked_ns
+            self.empty_ns = asked_ns
         return message
 
     def _to_chunk(self, message: "can.Message") -> Chunk:
@@ -212,7 +212,7 @@ class CanLink(PolledLink):
         """Return the monotonic arrival time of a CAN frame, or the current time if the time stamp is unusable."""
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return time.monotonic_ns()
-        return monotonic_arrival_ns(round(message.timestamp * 1e9), self._empty_ns)
+        return monotonic_arrival_ns(round(message.timestamp * 1e9), self.empty_ns)
 
     def _count_error_frame(self, message: "can.Message") -> None:
         """Count an error frame. Raise LinkLost if the error frame reports bus-off."""

@@ -38,8 +38,11 @@ if TYPE_CHECKING:
 DEFAULT_DECODER: Final = ""
 READ_BYTES: Final = 4096
 """Maximum number of bytes per system call. The buffer of a terminal in the Linux kernel has the same size."""
-MAX_WAITING_BYTES: Final = 16_384
-"""Number of bytes per read above which the next read does not wait. The kernel stores 64 KiB before bytes are lost."""
+MAX_WAITING_BYTES: Final = 131_072
+"""Number of bytes above which a read returns, and the next read does not wait.
+
+Linux stores 64 KiB before bytes are lost. A read therefore empties the buffer, however long the reader was delayed.
+"""
 DEFAULT_READ_TIMEOUT_S: Final = 0.01
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
@@ -167,12 +170,17 @@ class SerialLink(PolledLink):
                 return b""
             data = b""
             try:
-                while len(data) <= MAX_WAITING_BYTES and (more := os.read(self._file_number, READ_BYTES)):
+                while len(data) <= MAX_WAITING_BYTES:
+                    asked_ns = time.monotonic_ns()
+                    more = os.read(self._file_number, READ_BYTES)
                     data += more
-                    if len(more) < READ_BYTES // 2:  # the buffer of the terminal is empty
+                    if not more:
+                        break
+                    if len(data) < READ_BYTES // 2:  # the buffer of the terminal has not been full
+                        self.empty_ns = asked_ns
                         break
             except BlockingIOError:  # no more bytes have arrived
-                pass
+                self.empty_ns = asked_ns
             self._buffer_filling = len(data) > MAX_WAITING_BYTES
             if not data:
                 data = port.read(1)

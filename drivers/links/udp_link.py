@@ -108,7 +108,7 @@ class UdpLink(PolledLink):
             self._socket.settimeout(wait_s)
             size, ancillary, _, _ = self._socket.recvmsg_into([self._buffer], ANCILLARY_BYTES)
         except (TimeoutError, BlockingIOError):
-            self._empty_ns = asked_ns
+            self.empty_ns = asked_ns
             return None
         except OSError as error:
             self._close_source()
@@ -117,7 +117,7 @@ class UdpLink(PolledLink):
         for level, kind, data in ancillary:
             if (level, kind, len(data)) == (socket.SOL_SOCKET, SO_TIMESTAMPNS, TIMESPEC.size):
                 seconds, nanoseconds = TIMESPEC.unpack(data)
-                t_ns = monotonic_arrival_ns(seconds * 1_000_000_000 + nanoseconds, self._empty_ns)
+                t_ns = monotonic_arrival_ns(seconds * 1_000_000_000 + nanoseconds, self.empty_ns)
             elif (level, kind, len(data)) == (socket.SOL_SOCKET, SO_RXQ_OVFL, DROP_COUNT.size):
                 (dropped,) = DROP_COUNT.unpack(data)
                 self.dropped_datagrams += (dropped - self._dropped_by_socket) % (1 << 32)

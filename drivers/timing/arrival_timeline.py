@@ -5,8 +5,8 @@ Sample times lie on a line fitted to arrival time against sample index, so that 
 The arrival time is an upper bound of the sample time, because samples may wait in a buffer. Only prompt arrivals change
 the line. A short delay of the arrivals is attributed to the scheduler of the host. A delay that lasts for CATCH_UP_S
 means that samples are missing. After the reader itself has stalled, the arrivals count as late until they come no
-faster than the device measures. If they are behind the line at that time, the buffer of the kernel has overflowed, and
-the samples in between are missing.
+faster than the device measures, or until the link is known to have held no unread data. If the samples are behind the
+line at that time, the buffer of the kernel has overflowed, and the samples in between are missing.
 """
 
 from collections.abc import Iterator
@@ -82,10 +82,13 @@ class ArrivalTimeline:
         """Number of samples that were counted as missing before a change of the sample rate was detected."""
         self.rate_change: tuple[float | None, float] | None = None
         """Old and new sample rate in Hz after a change of the rate, until ``SampleClock`` has reported the change."""
+        self.data_were_dropped = False
+        """True if the link has dropped data between the newest samples."""
         self.rate_changes = RateChangeDetector(losses_are_counted)
         self._rejected_frames = RejectedFrameTest()
         self._delay: _Delay | None = None
         self._stall_end_ns: int | None = None  # end of a stall of the reader, until its backlog has been read
+        self._backlog_end_s: float | None = None  # time until which the newest backlog reached, if the rate is known
 
     def seconds_since_origin(self, t_ns: int) -> float:
         """Return the time since the first sample in seconds."""
@@ -220,15 +223,22 @@ class ArrivalTimeline:
             self.restart_line()
         self._stall_end_ns = stall_end_ns
 
+    def note_end_of_backlog(self, host_t_ns: int) -> None:
+        """Record that all samples that had arrived until ``host_t_ns`` have been added."""
+        if self._stall_end_ns is None or host_t_ns < self._stall_end_ns - BATCH_NS or self._line_is_backlog:
+            return
+        self._delay = self._stall_end_ns = None
+        self._backlog_end_s = self.seconds_since_origin(host_t_ns)
+
     def forget_delay(self) -> None:
         """Discard the current delay of the arrivals, because the link was closed."""
-        self._delay = self._stall_end_ns = None
+        self._delay = self._stall_end_ns = self._backlog_end_s = None
 
     def estimate_missing_from_delay(self, arrived_ns: int, arrived: int, counted: int, unit: float = 1.0) -> int:
         """Estimate the number of missing samples from a sudden delay of the arrivals.
 
-        The delay has to last for CATCH_UP_S. After a stall of the reader, the delay is evaluated as soon as the backlog
-        has been read.
+        The delay has to last for CATCH_UP_S, unless the link has dropped data. After a stall of the reader, the delay
+        is evaluated as soon as the backlog has been read.
 
         Parameters
         ----------
@@ -245,6 +255,8 @@ class ArrivalTimeline:
         if period_s is None:
             return 0
         least_s = max(MIN_GAP_PERIODS * period_s, MIN_GAP_S)
+        if gap := self._count_missing_after_backlog(counted - arrived, period_s, unit):
+            return gap
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
         behind_s = arrived_s - self.line.time_at_index_s(index)
         elapsed_s = (arrived_ns - max(self.arrived_ns, self._stall_end_ns or 0)) / NS_PER_S
@@ -260,8 +272,11 @@ class ArrivalTimeline:
                 return gap
         if not self.line.has_enough_points_for_gaps:
             return 0
+        pause_s = (arrived_ns - self.arrived_ns) / NS_PER_S - counted * period_s
+        if self.data_were_dropped and min(pause_s, behind_s) > period_s:
+            self._delay = None
+            return _count_samples(behind_s, period_s, unit)
         if self._delay is None:
-            pause_s = (arrived_ns - self.arrived_ns) / NS_PER_S - counted * period_s
             if pause_s > least_s and behind_s > least_s:
                 self._delay = _Delay(arrived_ns, behind_s, ArrivalRegression())
                 self._delay.line.add_point(index, arrived_s, self.nominal_hz)
@@ -269,6 +284,19 @@ class ArrivalTimeline:
         if not is_backlog:
             self._delay.line.add_point(index, arrived_s, self.nominal_hz)
         return self._update_delay(self._delay, arrived_ns, behind_s, unit)
+
+    def _count_missing_after_backlog(self, known: int, period_s: float, unit: float) -> int:
+        """Return the number of samples that should have been taken before the end of the backlog, and are missing.
+
+        ``known`` samples after the backlog are known to be missing.
+        """
+        if self._backlog_end_s is None:
+            return 0
+        missing_s = self._backlog_end_s - self.line.time_at_index_s(self.index + known)
+        self._backlog_end_s = None
+        return (
+            _count_samples(missing_s, period_s, unit) if missing_s > max(MIN_GAP_PERIODS * period_s, MIN_GAP_S) else 0
+        )
 
     def _update_delay(self, delay: "_Delay", arrived_ns: int, behind_s: float, unit: float) -> int:
         """Return the number of missing samples once a delay has lasted for CATCH_UP_S, and 0 otherwise."""

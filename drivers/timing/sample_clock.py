@@ -87,6 +87,7 @@ class SampleClock:
             self._sender = SenderTimeGapDetector(self._timeline, self._rows, self._events)
         self._stamped = 0  # number of time-stamped samples
         self._stamped_s = 0.0  # arrival or sender time from first to newest sample in s
+        self._dropped = 0  # number of times that the link has dropped data
         self._ended = self._resumed = self._paused = False
         self._idle_ns: int | None = None  # last time at which the link held no unread data
 
@@ -182,6 +183,18 @@ class SampleClock:
             End of the stall on the host clock in ns.
         """
         self._timeline.note_stall(stall_end_ns)
+
+    def note_end_of_backlog(self, host_t_ns: int) -> None:
+        """Record that the samples of all data that had arrived until a time on the host clock have been passed on.
+
+        If a stall ended before this time, samples that should have been taken until this time are missing.
+        """
+        self._timeline.note_end_of_backlog(host_t_ns)
+
+    def note_dropped_data(self, dropped: int) -> None:
+        """Record how often the link has dropped data before the next samples, so that gaps are counted at once."""
+        self._timeline.data_were_dropped = dropped > self._dropped
+        self._dropped = dropped
 
     def note_no_unread_data(self, host_t_ns: int) -> None:
         """Record a time on the host clock at which the link contained no unread data.

@@ -87,7 +87,7 @@ def test_late_read_keeps_the_arrival_time(channel: str) -> None:
     with can.Bus(interface="virtual", channel=channel, preserve_timestamps=True) as peer:
         link = build(interface="virtual", channel=channel)
         link.open()
-        link._empty_ns -= 400 * 10**9  # the reader has been stopped since then
+        link.empty_ns -= 400 * 10**9  # the reader has been stopped since then
         sent = []
         for age_s in (300.0, 200.0, 100.0):
             before = time.monotonic_ns() - age_s * 1e9
@@ -108,7 +108,7 @@ def test_interruption_between_reading_two_clocks_does_not_change_the_time(monkey
         return unix_ns + now_ns[0]
 
     link = build(interface="virtual", channel="none")
-    link._empty_ns = 10**12
+    link.empty_ns = 10**12
     monkeypatch.setattr(
         unix_to_monotonic_arrival,
         "time",

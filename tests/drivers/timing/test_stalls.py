@@ -11,6 +11,7 @@ from drivers.decoders.text_lines.text.settings import Settings
 from drivers.driver import Driver
 from drivers.errors import LinkEnded
 from drivers.links import unix_to_monotonic_arrival
+from drivers.links.base import PolledLink
 from drivers.timing.sample_clock import SampleClock
 from tests.support.loopback_link import LoopbackLink
 from tests.support.settings import read_settings
@@ -70,6 +71,76 @@ def test_stall_neither_bends_times_nor_miscounts(
     assert np.count_nonzero(np.abs(error_s - np.median(error_s)) > 0.02) <= 2
     assert clock.measured_hz == pytest.approx(RATE_HZ, rel=1e-4)
     assert clock.take_events() == []
+
+
+class StarvedLink(PolledLink):
+    """Link of a process that seldom runs for two minutes, so that the buffer overflows repeatedly.
+
+    If ``stamped`` is True, the kernel states the arrival time of each sample and counts the dropped samples.
+    """
+
+    carrier = "bytes"
+    epoch = "monotonic"
+    _open_source = _poll_source = _close_source = lambda self: None
+    _is_open = lambda self: True  # noqa: E731
+
+    def __init__(self, taken_s: np.ndarray, capacity: int, most: int, stamped: bool) -> None:
+        super().__init__("starved")
+        self.now_s = START_S
+        self._taken_s, self._capacity, self._most, self._stamped = taken_s, capacity, most, stamped
+        self._rng = np.random.default_rng(3)
+        self._waiting: list[tuple[int, int]] = []  # sample, and number of samples that had been dropped before it
+        self._sent = self._dropped = 0
+        if stamped:
+            self.dropped_datagrams = 0
+
+    def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
+        self.now_s += self._rng.exponential(8.0) if 40.0 < self.now_s - START_S < 160.0 else 0.02
+        arrived = int(np.searchsorted(self._taken_s, self.now_s, side="right"))
+        free = min(self._capacity - len(self._waiting), arrived - self._sent)
+        self._waiting += [(i, self._dropped) for i in range(self._sent, self._sent + free)]
+        self._dropped += arrived - self._sent - free
+        self._sent = arrived
+        if not self._waiting and arrived == self._taken_s.size:
+            raise LinkEnded("end")
+        read, self._waiting = self._waiting[: self._most], self._waiting[self._most :]
+        if read and self._stamped:
+            self.dropped_datagrams = read[-1][1]
+        if not self._waiting:
+            self.empty_ns = round(self.now_s * NS_PER_S)
+        times_s = [self._taken_s[i] if self._stamped else self.now_s for i, _ in read]
+        lines = [b"%d,%.3f\n" % (i % 256, i * 1e-3) for i, _ in read]
+        return [Chunk(line, round(t_s * NS_PER_S)) for line, t_s in zip(lines, times_s, strict=True)] or None
+
+
+@pytest.mark.parametrize("configured", [True, False])
+@pytest.mark.parametrize(
+    ("columns", "capacity", "most", "stamped"),
+    [(["-", "gx"], 1300, 2600, False), (["counter", "gx"], 1300, 2600, False), (["-", "gx"], 280, 256, True)],
+    ids=["terminal", "terminal, 8-bit counter", "datagrams"],
+)
+def test_starved_process_does_not_move_samples_beside_an_overflow(
+    columns: list[str], capacity: int, most: int, stamped: bool, configured: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken_s = START_S + np.arange(20_000) / RATE_HZ
+    link, blocks = StarvedLink(taken_s, capacity, most, stamped), []
+    for name in ("time.monotonic", "_read_suspend_aware_clock_s"):
+        monkeypatch.setattr(f"drivers.driver.{name}", lambda: link.now_s)
+    monkeypatch.setattr("drivers.driver.time.monotonic_ns", lambda: round(link.now_s * NS_PER_S))
+    counter = {"counter_modulus": 256} if "counter" in columns else {}
+    decoder = text.build(read_settings(Settings, {"columns": columns, "first_line": "keep"} | counter))
+    driver = Driver("a", link, decoder, SampleClock(decoder.timing, RATE_HZ if configured else None), blocks.append)
+    driver.run()
+    t_ns = np.concatenate([block.t_ns for block in blocks])
+    index = np.rint(np.concatenate([block.values[:, 0] for block in blocks]) * 1e3).astype(int)
+    error_s = (t_ns / NS_PER_S - taken_s[index])[index > 300]
+    assert taken_s.size - index.size > 2_000
+    assert driver.counts.lost == pytest.approx(taken_s.size - index.size, abs=2)
+    assert (np.diff(t_ns) > 0).all()
+    # A read may end between an overflow and the count of missing samples.
+    assert np.count_nonzero(np.abs(error_s - np.median(error_s)) > 0.02) <= 10
+    assert driver.clock.measured_hz == pytest.approx(RATE_HZ, rel=2e-4)
+    assert {event.kind for event in driver.take_events()} == {"samples_lost"}
 
 
 @pytest.mark.parametrize("configured", [True, False])
