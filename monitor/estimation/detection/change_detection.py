@@ -10,9 +10,9 @@ change, a bias step or a burst of outliers.
   (``tests/experiments/benchmarks/changes.py``). Typical thresholds are 13 to 20.
 - **Learning.** An octave can raise an alarm when its reference is older than ``NOISE_LEARN_S`` and contains
   ``MIN_REFERENCE_TERMS`` differences. Short octaves learn for eight seconds, and long octaves learn for 128 clusters.
-  During the first ``LEARN_S`` seconds, the threshold is higher. Changes during the learning time are not detected. A
-  slow drift of the noise is eventually reported as a change, because the reference contains all samples since the last
-  change.
+  While the reference is shorter than ``LEARN_S``, the threshold is higher, above all after a change. Changes during
+  the learning time are not detected. A slow drift of the noise is eventually reported as a change, because the
+  reference contains all samples since the last change.
 - **After a change**, the samples since the change become the new reference.
 - **Bursts.** A burst of outliers increases the number of large differences between samples, but not the median
   difference. Samples in a burst are removed from the reference.
@@ -164,7 +164,7 @@ class NoiseAndBiasChangeDetector:
             once, MIN_DWELL_SAMPLES, max(MAX_DWELL_S * rate_hz, MIN_DWELL_SAMPLES),
             LEARN_S * rate_hz, NOISE_LEARN_S * rate_hz,
         )  # fmt: skip
-        self._lines = LineOnsetDetector(rate_hz, OTHER_SHARE * alarms_per_day)
+        self._lines = LineOnsetDetector(rate_hz, OTHER_SHARE * alarms_per_day, LEARN_S)
         self._found: list[Change] = []
 
     @property

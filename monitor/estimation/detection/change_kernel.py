@@ -64,11 +64,8 @@ MIN_REFERENCE_TERMS: Final = 64
 The number is multiplied by F². The first factor F accounts for the reduced information in correlated squares. The
 second factor F ensures that the observed sums are much longer than the correlation time.
 """
-YOUNG_EVIDENCE: Final = 1.5
-"""Factor on the threshold of noise changes while the reference is younger than the learning time.
-
-Noise that is modulated over half a minute has not yet increased the factor F in this time.
-"""
+FIRST_SHARE: Final = 2.0 / 3.0
+"""Minimum factor on the evidence of a noise change before the first change."""
 MIN_BAND_TERMS: Final = 16
 """Minimum number of squared differences in a longer octave from which slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8
@@ -398,12 +395,20 @@ def _raise_cusums(
 
 @compiled
 def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
-    """Raise an alarm for a noise change, or restart the reference if it is too short."""
-    since = s.cusum[axis, j, i, SINCE]
-    enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
-    age, evidence = since - s.born[axis], s.cusum[axis, j, i, G]
-    if enough and age >= s.levels[NOISE_LEARN_TIME]:
-        if age >= s.levels[LEARN_TIME] or evidence > YOUNG_EVIDENCE * s.levels[H_NOISE]:
+    """Raise an alarm for a noise change, or restart the reference if it is too short.
+
+    The factor F of a reference that is shorter than the learning time does not contain slow fluctuations of the noise.
+    The threshold is therefore raised by the ratio of the learning time to the length of the reference, but by at most
+    1 / FIRST_SHARE before the first change. Noise that has changed once often goes on changing.
+    """
+    since, evidence = s.cusum[axis, j, i, SINCE], s.cusum[axis, j, i, G]
+    terms = s.band[axis, j, N] - s.cusum[axis, j, i, N1]
+    length = min(terms * (2 << j), since - s.born[axis])
+    if terms >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2 and length >= s.levels[NOISE_LEARN_TIME]:
+        share = min(length / s.levels[LEARN_TIME], 1.0)
+        if s.born[axis] == 0:
+            share = max(share, FIRST_SHARE)
+        if evidence * share > s.levels[H_NOISE]:
             _alarm(s, axis, NOISE, since, evidence, now)
     elif s.alarm[axis, KIND] == 0.0:
         _relearn(s, axis, j)

@@ -87,9 +87,11 @@ class LineOnsetDetector:
         Sample rate in Hz.
     alarms_per_day : float
         Accepted number of false alarms per day.
+    learn_s : float
+        Length of the reference in seconds up to which the threshold is higher.
     """
 
-    def __init__(self, rate_hz: float, alarms_per_day: float) -> None:
+    def __init__(self, rate_hz: float, alarms_per_day: float, learn_s: float) -> None:
         self._rate_hz = rate_hz
         self._n = 1 << round(log2(min(max(SEGMENT_S * rate_hz, MIN_SEGMENT), MAX_SEGMENT)))
         bins, hop = self._n // 2, self._n // 2
@@ -98,6 +100,7 @@ class LineOnsetDetector:
         """Number of samples until the next segment is complete."""
         looks = DAY_S * rate_hz / hop * bins * len(AXES)
         self._threshold = max(log(looks / alarms_per_day), 1.0)
+        self._learn_segments = learn_s * rate_hz / hop
         self._sum = np.zeros((len(AXES), bins))  # sum of the periodograms since the last change
         self._count = np.zeros((len(AXES), 1))  # number of these periodograms
         self._evidence = np.zeros((len(RATIOS), len(AXES), bins))
@@ -122,8 +125,10 @@ class LineOnsetDetector:
             power = np.where(usable[:, None], _periodogram(self._newest, self._n), 0.0)
             self._raise_evidence(power, usable)
         changes = []
-        for axis in np.flatnonzero(usable & (self._evidence > self._threshold).any(axis=(0, 2))):
-            evidence = self._evidence[:, axis]
+        # As in the change detector, a short reference does not contain slow fluctuations.
+        length = np.minimum((self._count - self._count1) / self._learn_segments, 1.0)
+        for axis in np.flatnonzero(usable & (self._evidence * length > self._threshold).any(axis=(0, 2))):
+            evidence = self._evidence[:, axis] * length[:, axis]
             ratio = int(np.flatnonzero((evidence > self._threshold).any(axis=1))[-1])  # has the most accurate onset
             top = int(evidence[ratio].argmax())
             count = self._count1[ratio, axis, top]
@@ -246,9 +251,12 @@ def _periodogram(part: Floats, n: int) -> Floats:
 def _lasts(part: Floats, turns: float, amplitude: float) -> bool:
     """Return True if both halves of the samples contain a sinusoid of about the stated amplitude."""
     half = len(part) // 2
-    window = np.hanning(half)
-    rotation = np.exp(-2j * np.pi * turns * np.arange(half)) * window * (2.0 / window.sum())
-    halves = [abs(np.nansum((x - np.nanmean(x)) * rotation)) for x in (part[:half], part[-half:])]
+    rotation = np.exp(-2j * np.pi * turns * np.arange(half))
+    halves = []
+    for x in (part[:half], part[-half:]):
+        window = np.hanning(half) * np.isfinite(x)
+        weight, x = max(window.sum(), 1e-300), np.nan_to_num(x)
+        halves.append(2.0 / weight * abs(np.sum(window * (x - window @ x / weight) * rotation)))
     return bool(min(halves) > MIN_LASTING_AMPLITUDE * amplitude)
 
 
