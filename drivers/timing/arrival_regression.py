@@ -117,11 +117,6 @@ class ArrivalRegression:
         r2 = self._sxt * self._sxt / (self._sxx * self._stt) if self._stt > 0.0 else 0.0
         return self._sxx / self._sxt, UNCERTAINTY_FACTOR * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
 
-    def is_slower_than(self, period_s: float) -> bool:
-        """Return True if the measured sample period is significantly longer than ``period_s``."""
-        found = self.measure_rate()
-        return found is not None and found[0] * period_s < 1.0 - found[1]
-
     def period_s(self) -> float | None:
         """Return the sample period in seconds. None if there is no nominal rate and there are too few points."""
         if self.count >= 2 and self._sxt > 0.0 and (self.has_enough_points_for_gaps or self._nominal_s is None):

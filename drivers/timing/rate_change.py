@@ -2,8 +2,9 @@
 
 The rates of both windows have to differ from the rate before the windows, and to agree with each other. A window lasts
 until its rate can be measured, which takes at least 2 s and 20 samples. Samples that are lost without being counted
-change the rate of a window at random. The limit of such formats therefore depends on the number of samples: for losses
-of 5 % with a mean burst length of 3 samples, it is four standard deviations.
+change the rate of a window at random. The limit of such formats therefore depends on the number of samples and on the
+measured scatter of the windows, and is at least four standard deviations for losses of 5 % with a mean burst length of
+3 samples.
 """
 
 from math import log, sqrt
@@ -17,7 +18,13 @@ from drivers.timing.arrival_regression import ArrivalRegression
 MIN_CHANGE: Final = 0.05
 """Minimum relative change of the rate. Slowly varying delays of the arrivals cause smaller changes."""
 UNCOUNTED_LOSS_FACTOR: Final = 1.5
-"""Limit of the relative change times the square root of the number of samples, if lost samples are not counted."""
+"""Minimum limit of the relative change times the square root of the number of samples, if losses are not counted."""
+SCATTER_FACTOR: Final = 5.0
+"""Limit of the relative change divided by the standard deviation of the windows, if losses are not counted."""
+SCATTER_WEIGHT: Final = 0.05
+"""Weight of the newest window in the measured scatter."""
+MAX_SQUARE: Final = 4.0
+"""Maximum square of a deviation, divided by the scatter. A single stall must not hide a later change of the rate."""
 
 
 class RateChangeDetector:
@@ -39,6 +46,8 @@ class RateChangeDetector:
 
     def __init__(self, losses_are_counted: bool) -> None:
         self.losses_are_counted = losses_are_counted
+        # mean square of the relative deviation of a window, times its number of samples
+        self._scatter = (UNCOUNTED_LOSS_FACTOR / SCATTER_FACTOR) ** 2
         self.restart()
 
     @property
@@ -75,19 +84,26 @@ class RateChangeDetector:
         if found is None:
             return None
         self._line = None
-        if self._before is None or not self._differ(found, self._before, index):
-            self._candidate = None
-        elif self._candidate is not None and not self._differ(found, self._candidate, index):
+        if self._before is None:
+            return None
+        samples = index - self._first_index
+        differs = self._differ(found, self._before, samples)
+        if differs and self._candidate is not None and not self._differ(found, self._candidate, samples):
             return line
-        else:
-            self._candidate = found
+        square = log(found[0] / self._before[0]) ** 2 * samples
+        self._scatter += SCATTER_WEIGHT * (min(square, MAX_SQUARE * self._scatter) - self._scatter)
+        self._candidate = found if differs else None
         return None
 
-    def _differ(self, a: tuple[float, float], b: tuple[float, float], index: float) -> bool:
-        limit = max(MIN_CHANGE, a[1] + b[1])
-        if not self.losses_are_counted:
-            limit = max(limit, UNCOUNTED_LOSS_FACTOR / sqrt(index - self._first_index))
-        return abs(log(a[0] / b[0])) > limit
+    def min_change(self, samples: float) -> float:
+        """Return the minimum relative change of the rate that is significant in a number of samples."""
+        if self.losses_are_counted:
+            return MIN_CHANGE
+        scatter = max(UNCOUNTED_LOSS_FACTOR, SCATTER_FACTOR * sqrt(self._scatter))
+        return max(MIN_CHANGE, scatter / sqrt(samples))
+
+    def _differ(self, a: tuple[float, float], b: tuple[float, float], samples: float) -> bool:
+        return abs(log(a[0] / b[0])) > max(self.min_change(samples), a[1] + b[1])
 
 
 def count_false_losses(old_periods: Floats, new_periods: Floats) -> int:

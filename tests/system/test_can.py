@@ -15,7 +15,7 @@ import pytest
 
 from drivers.data_types import AXES, Chunk, make_block
 from drivers.decoders import dbc
-from drivers.links.base import Link
+from drivers.links.base import PolledLink
 from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings
 from tests.support.settings import read_settings
@@ -178,7 +178,7 @@ def encode_slcan(message: can.Message) -> bytes:
     return f"{address}{len(message.data)}{message.data.hex().upper()}\r".encode()
 
 
-def stamp_as_recorded(link: Link, messages: list[can.Message]) -> None:
+def stamp_as_recorded(link: PolledLink, messages: list[can.Message]) -> None:
     """Give the frames of the IMU the times at which they were recorded.
 
     The frames have no counter, so a pause of a loaded machine would count as lost samples.
@@ -190,6 +190,7 @@ def stamp_as_recorded(link: Link, messages: list[can.Message]) -> None:
 
     def read_and_stamp(timeout_s: float) -> list[Chunk] | None:
         chunks = read(timeout_s)
+        link.empty_ns = 0  # the recorded times are earlier than the clock
         return None if chunks is None else [replace(chunk, t_ns=next(times_ns)) for chunk in chunks]
 
     link.wait_for_chunks_or_timeout = read_and_stamp  # type: ignore[method-assign]
@@ -216,7 +217,9 @@ bitrate = 500000
 decoder = "dbc"
 """
     with run_service(tmp_path, config + OPTIONS) as run:
-        stamp_as_recorded(run.worker("imu").driver.link, messages)
+        link = run.worker("imu").driver.link
+        assert isinstance(link, PolledLink)
+        stamp_as_recorded(link, messages)
         assert adapter.opened.wait(PATIENCE_S)
         send_at_rate(terminal.write, [encode_slcan(message) for message in messages], 1500.0)
         counts = run.worker("imu").driver.counts

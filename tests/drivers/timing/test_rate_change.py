@@ -74,3 +74,19 @@ def test_losses_jitter_and_stalls_are_no_change_of_the_rate(seed: int) -> None:
     for t_s in np.split(arrived_s, np.flatnonzero(np.diff(arrived_s)) + 1):
         clock.assign_times(make_block(np.rint((START_S + t_s) * NS_PER_S).astype(np.int64), np.zeros((t_s.size, 6))))
     assert clock.take_events() == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("rate_hz", "share", "burst"), [(100.0, 0.2, 3.0), (100.0, 0.05, 5.0), (25.0, 0.05, 5.0)])
+def test_uncounted_losses_in_bursts_are_no_change_of_the_rate(rate_hz: float, share: float, burst: float) -> None:
+    """An hour and a half of samples that are lost in bursts of geometrically distributed length."""
+    rng = np.random.default_rng(7)
+    n = round(5400 * rate_hz)
+    kept = rng.geometric(share / burst / (1.0 - share), n)
+    runs = np.column_stack([kept, rng.geometric(1.0 / burst, n)]).ravel().cumsum()
+    taken_s = np.flatnonzero(np.searchsorted(runs, np.arange(n), side="right") % 2 == 0) / rate_hz
+    arrived_s = np.ceil((taken_s + rng.exponential(0.002, taken_s.size)) / 0.1) * 0.1
+    clock = SampleClock(ArrivalTimedFormat(), None)
+    for t_s in np.split(arrived_s, np.flatnonzero(np.diff(arrived_s)) + 1):
+        clock.assign_times(make_block(np.rint((START_S + t_s) * NS_PER_S).astype(np.int64), np.zeros((t_s.size, 6))))
+    assert clock.take_events() == []
