@@ -182,7 +182,7 @@ def fit_thermal_model_stepwise(
         yield from search.add_lags()
     found = search.fit()
     if not found.explained > 0.0:  # a significant term beside a strong random walk may still predict worse than none
-        search.select_constant()
+        search.shape = CONSTANT
         found = search.fit()
     return found
 
@@ -232,7 +232,7 @@ class _FormSearch:
     """
 
     def __init__(self, means: IntervalMeans, since: int | None, shape: ThermalModelForm = CONSTANT) -> None:
-        self._means, self._shape, self._since = means, shape, since
+        self._means, self.shape, self._since = means, shape, since
         self._tests: list[TermTest] = []
         temperature_c = interpolate_missing_temperatures(means.temperature_c)
         self._reference_c = round(float(temperature_c.mean()), 2)
@@ -254,12 +254,12 @@ class _FormSearch:
         added = True
         while added:
             added = False
-            powers = self._shape.powers
+            powers = self.shape.powers
             trials = MAX_POWER - powers
             for more in range(1, trials + 1):
                 yield
                 level = SIGNIFICANCE if powers + more <= CUBIC else HIGH_POWER_SIGNIFICANCE
-                shape = replace(self._shape, powers=powers + more)
+                shape = replace(self.shape, powers=powers + more)
                 if self._accept(shape, self._test_powers(shape, more), trials, level):
                     added = True
                     break
@@ -269,18 +269,14 @@ class _FormSearch:
         for k in range(1, MAX_LAGS + 1):
             if INTERVALS_PER_SQUARED_LAGS * k**2 >= int(self._means.both_known.sum()):
                 return
-            shape = yield from self._find_lag(self._shape)
+            shape = yield from self._find_lag(self.shape)
             if shape is None or not self._accept(shape, self._test_lag(shape), LAG_TRIALS, SIGNIFICANCE):
                 return
             yield from self._drop_powers()
 
-    def select_constant(self) -> None:
-        """Select the form of a bias that does not depend on temperature."""
-        self._shape = CONSTANT
-
     def fit(self) -> ThermalFit:
         """Fit the coefficients of the selected form."""
-        means, shape, own = self._means, self._shape, self._nuisance.shape[1]
+        means, shape, own = self._means, self.shape, self._nuisance.shape[1]
         columns = self._columns(shape)
         known = means.both_known
         estimate = self._estimate(columns)
@@ -331,7 +327,7 @@ class _FormSearch:
         p_value = 1.0 if test is None else min(trials * test.p_value, 1.0)
         self._tests.append(TermTest(shape, p_value))
         if p_value < level:
-            self._shape = shape
+            self.shape = shape
         return p_value < level
 
     def _columns(self, shape: ThermalModelForm) -> Floats:
@@ -365,7 +361,7 @@ class _FormSearch:
     def _test_step(self) -> float:
         """Return the p-value of the bias step."""
         average = self._grouping.average
-        nuisance = np.hstack([self._nuisance[:, :-1], self._columns(self._shape)])
+        nuisance = np.hstack([self._nuisance[:, :-1], self._columns(self.shape)])
         found = f_test(self._y, average(nuisance), average(self._nuisance[:, -1:]), self._grouping.known)
         return 1.0 if found is None else found.p_value
 
@@ -400,16 +396,16 @@ class _FormSearch:
 
     def _drop_powers(self) -> StepwiseWork[None]:
         """Drop the highest powers that are not significant beside the lags, and fit the last lag again."""
-        powers = self._shape.powers
-        while self._shape.powers:
+        powers = self.shape.powers
+        while self.shape.powers:
             yield
-            test = self._test_powers(self._shape, 1)
+            test = self._test_powers(self.shape, 1)
             if test is not None and test.p_value < SIGNIFICANCE:
                 break
-            self._shape = replace(self._shape, powers=self._shape.powers - 1)
-        if self._shape.powers < powers:
-            again = yield from self._find_lag(replace(self._shape, constants_s=self._shape.constants_s[:-1]))
-            self._shape = again or self._shape
+            self.shape = replace(self.shape, powers=self.shape.powers - 1)
+        if self.shape.powers < powers:
+            again = yield from self._find_lag(replace(self.shape, constants_s=self.shape.constants_s[:-1]))
+            self.shape = again or self.shape
 
 
 def _residual_correlation(residuals: Floats, degrees_of_freedom: int) -> tuple[float, float]:
