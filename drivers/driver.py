@@ -21,7 +21,7 @@ import numpy as np
 from drivers.data_types import AXES, NS_PER_S, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
-from drivers.links.base import DropCountingLink, Link, PolledLink
+from drivers.links.base import Link, PolledLink
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
@@ -139,6 +139,7 @@ class Driver:
         self._undecoded_since = ""  # local time of day of the first byte without a sample
         self._undecoded_capture = b""  # first bytes of a device whose bytes cannot be decoded
         self._format_hint = ""
+        self._polled = link if isinstance(link, PolledLink) else None
         self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
         self._reported_drops = 0  # number of samples that the decoder dropped and that have been reported as missing
         self._last_data_s = 0.0
@@ -233,8 +234,8 @@ class Driver:
         self._last_data_s = time.monotonic()
         if self._keep is not None:
             self._keep(chunks)
-        if isinstance(self.link, DropCountingLink):
-            self.clock.note_dropped_data(self.link.dropped_datagrams)
+        if self._polled is not None:
+            self.clock.note_dropped_data(self._polled.dropped_datagrams)
         samples = self.decoder.feed(chunks)
         if not samples:
             self._check_undecoded(b"".join(chunk.data for chunk in chunks))
@@ -249,8 +250,8 @@ class Driver:
                 self._count_samples(stamped, dropped)
                 self._push(self._axes.map_axes(stamped))
                 dropped = 0  # the dropped samples are missing only before the first block
-        if isinstance(self.link, PolledLink) and not self.times_are_unix:
-            self.clock.note_end_of_backlog(self.link.empty_ns)
+        if self._polled is not None and not self.times_are_unix:
+            self.clock.note_end_of_backlog(self._polled.empty_ns)
         self._count_decoder_drops()
         if false_losses := self.clock.take_false_losses():
             self.counts.lost = max(self.counts.lost - false_losses, 0)
@@ -295,7 +296,7 @@ class Driver:
     def _describe_dropped(self) -> str:
         """Return a text that is appended to a message about missing samples if the receive buffer of the link was
         full."""
-        total = self.link.dropped_datagrams if isinstance(self.link, DropCountingLink) else 0
+        total = self._polled.dropped_datagrams if self._polled is not None else 0
         dropped, self._reported_datagrams = total - self._reported_datagrams, total
         return f"; {dropped} datagrams were dropped because the receive buffer was full" if dropped else ""
 

@@ -81,6 +81,8 @@ class PolledLink(ABC):
         self._in_use = threading.Lock()
         self.empty_ns = 0
         """Newest monotonic time in ns at which the source is known to have held no unread data."""
+        self.dropped_datagrams = 0
+        """Number of datagrams that the kernel is known to have dropped before they could be read."""
 
     def open(self) -> None:
         """Open the source if the source is closed. Raise ``LinkUnavailable`` if opening fails."""
@@ -139,10 +141,3 @@ class BatchingLink(Protocol):
 
     def set_default_read_timeout(self, timeout_s: float) -> None:
         """Set the time in s that received bytes may wait, unless the configuration states ``read_timeout``."""
-
-
-@runtime_checkable
-class DropCountingLink(Protocol):
-    """Interface of a link that knows how many datagrams were dropped before they could be read."""
-
-    dropped_datagrams: int  # since the link was created

@@ -67,7 +67,6 @@ class UdpLink(PolledLink):
         self._socket: socket.socket | None = None
         self._buffer = bytearray(MAX_DATAGRAM_BYTES)
         self._dropped_by_socket = 0  # number of datagrams that the kernel has dropped since the socket was opened
-        self.dropped_datagrams = 0
 
     def _is_open(self) -> bool:
         return self._socket is not None

@@ -504,9 +504,8 @@ def test_report_of_missing_samples_names_dropped_datagrams(monkeypatch):
     monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now_s[0], monotonic_ns=lambda: 0))
     rig = DriverRig()
     driver = rig.driver
-    rig.link.dropped_datagrams = 0
     for dropped in (2, 2, 5):
-        rig.link.dropped_datagrams = dropped
+        driver._polled = SimpleNamespace(dropped_datagrams=dropped)
         driver._count_samples(make_block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=9), 0)
         driver._report_lost()
         now_s[0] += 1.0

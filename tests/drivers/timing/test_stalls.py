@@ -91,8 +91,6 @@ class StarvedLink(PolledLink):
         self._rng = np.random.default_rng(3)
         self._waiting: list[tuple[int, int]] = []  # sample, and number of samples that had been dropped before it
         self._sent = self._dropped = 0
-        if stamped:
-            self.dropped_datagrams = 0
 
     def wait_for_chunks_or_timeout(self, timeout_s: float) -> list[Chunk] | None:
         self.now_s += self._rng.exponential(8.0) if 40.0 < self.now_s - START_S < 160.0 else 0.02
