@@ -260,7 +260,7 @@ class ArrivalTimeline:
         if period_s is None:
             return 0
         least_s = max(MIN_GAP_PERIODS * period_s, MIN_GAP_S)
-        if gap := self._count_missing_after_backlog(counted - arrived, period_s, unit):
+        if gap := self._count_missing_after_backlog(counted - arrived, least_s, period_s, unit):
             return gap
         index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
         behind_s = arrived_s - self.line.time_at_index_s(index)
@@ -290,18 +290,16 @@ class ArrivalTimeline:
             self._delay.line.add_point(index, arrived_s, self.nominal_hz)
         return self._update_delay(self._delay, arrived_ns, behind_s, unit)
 
-    def _count_missing_after_backlog(self, known: int, period_s: float, unit: float) -> int:
+    def _count_missing_after_backlog(self, known: int, least_s: float, period_s: float, unit: float) -> int:
         """Return the number of samples that should have been taken before the end of the backlog, and are missing.
 
-        ``known`` samples after the backlog are known to be missing.
+        ``known`` samples after the backlog are known to be missing. A gap shorter than ``least_s`` seconds is jitter.
         """
         if self._backlog_end_s is None:
             return 0
         missing_s = self._backlog_end_s - self.line.time_at_index_s(self.index + known)
         self._backlog_end_s = None
-        return (
-            _count_samples(missing_s, period_s, unit) if missing_s > max(MIN_GAP_PERIODS * period_s, MIN_GAP_S) else 0
-        )
+        return _count_samples(missing_s, period_s, unit) if missing_s > least_s else 0
 
     def _update_delay(self, delay: "_Delay", arrived_ns: int, behind_s: float, unit: float) -> int:
         """Return the number of missing samples once a delay has lasted for CATCH_UP_S, and 0 otherwise."""

@@ -4,7 +4,7 @@ The rates of both windows have to differ from the rate before the windows, and t
 until its rate can be measured, which takes at least 2 s and 20 samples. Samples that are lost without being counted
 change the rate of a window at random. The limit of such formats therefore depends on the number of samples and on the
 measured scatter of the windows, and is at least four standard deviations for losses of 5 % with a mean burst length of
-3 samples.
+3 samples. If a fifth of the samples is suddenly lost without being counted, this is a change of the rate.
 """
 
 from math import log, sqrt
@@ -17,10 +17,10 @@ from drivers.timing.arrival_regression import ArrivalRegression
 
 MIN_CHANGE: Final = 0.05
 """Minimum relative change of the rate. Slowly varying delays of the arrivals cause smaller changes."""
-UNCOUNTED_LOSS_FACTOR: Final = 1.5
-"""Minimum limit of the relative change times the square root of the number of samples, if losses are not counted."""
 SCATTER_FACTOR: Final = 5.0
 """Limit of the relative change divided by the standard deviation of the windows, if losses are not counted."""
+MIN_SCATTER: Final = 0.09
+"""Minimum scatter, so that losses that begin after days without losses are no change of the rate."""
 SCATTER_WEIGHT: Final = 0.05
 """Weight of the newest window in the measured scatter."""
 MAX_SQUARE: Final = 4.0
@@ -46,8 +46,7 @@ class RateChangeDetector:
 
     def __init__(self, losses_are_counted: bool) -> None:
         self.losses_are_counted = losses_are_counted
-        # mean square of the relative deviation of a window, times its number of samples
-        self._scatter = (UNCOUNTED_LOSS_FACTOR / SCATTER_FACTOR) ** 2
+        self._scatter = MIN_SCATTER  # mean square of the relative deviation of a window, times its number of samples
         self.restart()
 
     @property
@@ -91,7 +90,8 @@ class RateChangeDetector:
         if differs and self._candidate is not None and not self._differ(found, self._candidate, samples):
             return line
         square = log(found[0] / self._before[0]) ** 2 * samples
-        self._scatter += SCATTER_WEIGHT * (min(square, MAX_SQUARE * self._scatter) - self._scatter)
+        change = min(square, MAX_SQUARE * self._scatter) - self._scatter
+        self._scatter = max(self._scatter + SCATTER_WEIGHT * change, MIN_SCATTER)
         self._candidate = found if differs else None
         return None
 
@@ -99,8 +99,7 @@ class RateChangeDetector:
         """Return the minimum relative change of the rate that is significant in a number of samples."""
         if self.losses_are_counted:
             return MIN_CHANGE
-        scatter = max(UNCOUNTED_LOSS_FACTOR, SCATTER_FACTOR * sqrt(self._scatter))
-        return max(MIN_CHANGE, scatter / sqrt(samples))
+        return max(MIN_CHANGE, SCATTER_FACTOR * sqrt(self._scatter / samples))
 
     def _differ(self, a: tuple[float, float], b: tuple[float, float], samples: float) -> bool:
         return abs(log(a[0] / b[0])) > max(self.min_change(samples), a[1] + b[1])
