@@ -65,7 +65,7 @@ The number is multiplied by F². The first factor F accounts for the reduced inf
 second factor F ensures that the observed sums are much longer than the correlation time.
 """
 FIRST_SHARE: Final = 2.0 / 3.0
-"""Minimum factor on the evidence of a noise change before the first change."""
+"""Minimum factor on the evidence of a noise change while the reference begins at the start of the detector."""
 MIN_BAND_TERMS: Final = 16
 """Minimum number of squared differences in a longer octave from which slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from monitor.estimation.detection import line_onset_detection
 from monitor.estimation.detection.change_detection import NoiseAndBiasChangeDetector
 
 RATE_HZ = 100.0
@@ -62,6 +63,14 @@ def test_burst_of_oscillation_is_not_a_line_that_begins():
     values = simulate_noise(100)
     values[5_000:5_100, 0] += 3.0 * SIGMA * sinusoid(100, 23.4)
     assert not [change for change in find_changes(values) if "line" in change.text]
+
+
+def test_missing_samples_change_no_amplitude():
+    values = sinusoid(200, 23.4)
+    values[20:80] = np.nan
+    assert line_onset_detection._lasts(values, 23.4 / RATE_HZ, 1.0)
+    values[:100] = np.nan
+    assert not line_onset_detection._lasts(values, 23.4 / RATE_HZ, 1.0)
 
 
 @pytest.mark.parametrize("factor", [1.5, 10.0])
