@@ -181,7 +181,8 @@ def fit_thermal_model_stepwise(
     if search.temperature_rose_and_fell or always_try_lags:
         yield from search.add_lags()
     found = search.fit()
-    if not found.explained > 0.0:  # a significant term beside a strong random walk may still predict worse than none
+    # Beside a strong random walk, a significant term may still predict worse than none.
+    if found.explained == 0.0 and not search.shape.is_constant:
         search.shape = CONSTANT
         found = search.fit()
     return found
