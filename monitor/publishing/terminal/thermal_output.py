@@ -26,8 +26,8 @@ from monitor.publishing.terminal.tables import plain_table, print_line, print_no
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
 LEGEND: Final = (
-    "constant: no dependence on temperature is significant beside the slow noise of the axis, or it explains nothing. "
-    "leaves: rms of the means minus the model."
+    "constant: no dependence on temperature is significant beside the slow noise of the axis, or the dependence "
+    "explains nothing. leaves: rms of the means minus the model."
 )
 ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor hysteresis can be determined"
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
