@@ -82,7 +82,7 @@ def receive(
     return driver, np.concatenate([row.t_ns for row in rows])
 
 
-@pytest.mark.parametrize("garbage_share", [0.0, 0.1, 0.5, 0.99])
+@pytest.mark.parametrize("garbage_share", [0.0, 0.5, 0.99])
 @pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize("name", DECODERS)
 def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
@@ -122,7 +122,7 @@ def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
 def test_damaged_samples_keep_their_place_in_time(configured: bool, damaged_share: float, jitter_s: float) -> None:
     """Lines are damaged on the wire, so that each rejected line was a sample."""
     rng = np.random.default_rng(6)
-    n = 12_000
+    n = 8_000
     good = send_samples(build_text(), n)
     damaged = rng.random(n) < damaged_share
     damaged[:100] = damaged[-1] = False
@@ -137,7 +137,7 @@ def test_damaged_samples_keep_their_place_in_time(configured: bool, damaged_shar
     assert (counts.received, counts.bad) == (n - damaged.sum(), damaged.sum())
     assert counts.lost <= 2
     assert driver.clock.measured_hz == pytest.approx(RATE_HZ, rel=0.005)
-    error_ns = (t_ns - arrived_ns[~damaged])[-5000:]
+    error_ns = (t_ns - arrived_ns[~damaged])[-3000:]
     assert np.ptp(error_ns) < 1e9 * (jitter_s + 0.004)
 
 
