@@ -88,14 +88,14 @@ class DeviceStatus:
                 return f"{ready.progress}; {lacking}no sample is lost"
             if not worker.pipeline.fit_kernels_can_run:
                 return "compiling the estimator; no coefficients yet, no sample is lost"
-        lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
+        about = self._estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
-            return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
+            return f"{driver.text.rstrip('.')}; {about}" if about else driver.text
         offset_text = worker.timeline.host_clock_offset_text()
-        return lacking or driver.late_frames_hint or offset_text or driver.on_board_filter_note
+        return about or driver.late_frames_hint or offset_text or driver.on_board_filter_note
 
-    def _missing_estimate_text(self) -> str:
-        """Return the reason why coefficients cannot be estimated, or ""."""
+    def _estimate_text(self) -> str:
+        """Return the reason why coefficients cannot be estimated or do not describe one noise, or ""."""
         worker, clock = self._worker, self._worker.clock
         measured_hz = clock.contradicting_rate_hz
         if measured_hz is not None:
@@ -109,4 +109,4 @@ class DeviceStatus:
             and clock.configured_or_measured_rate_hz is None
         ):
             return "no estimate: the times of the samples do not show a rate; set `rate`"
-        return worker.pipeline.refusal_reason
+        return worker.pipeline.refusal_reason or worker.pipeline.mixed_noise_text()

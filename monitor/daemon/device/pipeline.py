@@ -69,6 +69,7 @@ class DevicePipeline:
         """True if samples have been processed since the last refit."""
         self.since_ns: list[int | None] = [None] * len(AXES)
         """Time of the first sample after the last restart of each axis in nanoseconds, or None."""
+        self._changed_ns: list[int | None] = [None] * len(AXES)  # the noise changed, and the axis was not restarted
         self.newest_ns = 0
         """Time of the newest processed sample in nanoseconds, or 0."""
         self.arma_worker = ArmaWorker(f"drift of {device.name}", synchronous=replayed)
@@ -214,6 +215,18 @@ class DevicePipeline:
             if one is not None:
                 one.set_rate(rate_hz)
 
+    def mixed_noise_text(self) -> str:
+        """Return which axes have samples from before a change of the noise in their window, or ""."""
+        if self.estimator is None:
+            return ""
+        begin_ns = self.newest_ns - round(self.estimator.samples_in_window / self.estimator.rate_hz * 1e9)
+        mixed = [
+            axis for axis, at_ns in zip(AXES, self._changed_ns, strict=True) if at_ns is not None and at_ns > begin_ns
+        ]
+        if not mixed:
+            return ""
+        return f"the noise of {', '.join(mixed)} changed within the window, which is not restarted (`restart = false`)"
+
     def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and the temperatures [n] in °C, or None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.samples_in_window:
@@ -274,12 +287,15 @@ class DevicePipeline:
         restarts = (
             self.motion_and_change_monitor.take_restart_requests() if self.motion_and_change_monitor is not None else []
         )
-        if self.estimator is None or not self._device.restart or self._replaying:
+        if self.estimator is None or self._replaying:
             return
         for restart in restarts:
-            self.estimator.restart_axis(restart.axis, restart.samples)
-            back_ns = round((restart.samples - 0.5) / self.estimator.rate_hz * 1e9)
-            self.since_ns[restart.axis] = self.newest_ns - back_ns
+            at_ns = self.newest_ns - round((restart.samples - 0.5) / self.estimator.rate_hz * 1e9)
+            if self._device.restart:
+                self.estimator.restart_axis(restart.axis, restart.samples)
+                self.since_ns[restart.axis] = at_ns
+            else:
+                self._changed_ns[restart.axis] = at_ns
 
     def _update_thermal(self) -> None:
         if self.motion_and_change_monitor is None or self.thermal is None:

@@ -84,6 +84,7 @@ class WorkerHarness:
         thermal_s=600.0,
         compensate=True,
         link=None,
+        restart=True,
     ):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
         self.link = link or LoopbackLink()
@@ -98,6 +99,7 @@ class WorkerHarness:
             model=model,
             thermal_s=thermal_s,
             compensate=compensate,
+            restart=restart,
         )
         self.wake = WakeSignal()
         self.ready = ready or KernelReadiness()
@@ -280,6 +282,20 @@ def test_reset_empties_the_window():
     harness.process(1001.0, drain=True)
     assert harness.output.estimates[-1][1].curve.n == 30
     assert harness.output.estimates[-1][1].samples == 530
+
+
+@pytest.mark.parametrize("restart", [True, False])
+def test_status_names_axes_whose_window_mixes_old_and_new_noise(restart):
+    harness = WorkerHarness(window_s=60.0, restart=restart)
+    harness.worker.driver.state, harness.worker.driver.text = "running", ""
+    texts = []
+    for i in range(150):
+        harness.push_samples(100, scale=4.0 if i >= 40 else 1.0)
+        harness.process(1000.0 + i, drain=i == 149)
+        texts.append(harness.worker.status.build_health({}, 0).text)
+    mixed = "the noise of gx, gy, gz, ax, ay, az changed within the window, which is not restarted (`restart = false`)"
+    assert (mixed in texts) is not restart
+    assert not any("changed" in text for text in texts[:40] + texts[105:])
 
 
 def test_lost_samples_occupy_the_window_and_a_long_loss_empties_it():
@@ -491,7 +507,7 @@ def test_low_rate_device_is_estimated_by_interpreted_kernels():
     harness.process(1000.0)
     assert harness.output.estimates[-1][1].coefficients.status.max() > 0
     assert harness.worker.pipeline.motion_and_change_monitor is not None
-    harness.worker.driver.state = "running"
+    harness.worker.driver.state, harness.worker.driver.text = "running", ""
     harness.ready.progress = "compiling 2 of 8: fit"
     assert harness.worker.status.build_health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
 
@@ -793,7 +809,7 @@ def replay_two_samples(tmp_path, **more):
 def test_recording_has_no_time_before_its_first_sample(tmp_path):
     harness = replay_two_samples(tmp_path)
     harness.worker.slew_and_publish_status({}, 0)
-    harness.worker.driver.state = "running"
+    harness.worker.driver.state, harness.worker.driver.text = "running", ""
     harness.worker.slew_and_publish_status({}, 0)
     harness.worker.publish_event("recording_stopped", "no room")
     harness.process(1000.0)
@@ -812,7 +828,7 @@ def test_first_sample_in_the_ring_gives_the_time(tmp_path):
     harness = replay_two_samples(tmp_path, ready=KernelReadiness())
     harness.worker.driver.first_t_ns = 10_000_000  # as the reader sets it
     harness.push_samples(10)
-    harness.worker.driver.state = "running"
+    harness.worker.driver.state, harness.worker.driver.text = "running", ""
     harness.process(1000.0)
     assert harness.output.blocks == []
     assert harness.worker.timeline.now_unix_s() == 0.01
@@ -822,7 +838,7 @@ def test_time_of_a_lost_device_with_its_own_clock_advances(monkeypatch):
     harness = WorkerHarness(decoder=samples.build(samples.Settings()))
     assert harness.worker.driver.times_are_unix
     assert harness.worker.timeline.now_unix_s() is None
-    harness.worker.driver.state = "running"
+    harness.worker.driver.state, harness.worker.driver.text = "running", ""
     harness.push_samples(11)
     harness.process(1000.0)
     assert harness.worker.timeline.now_unix_s() == 0.1
