@@ -126,7 +126,7 @@ def _allan_variances_of_axis(rate: Floats, factors: Ints, pauses: Ints = NO_PAUS
     with np.errstate(invalid="ignore"):  # 0/0 if no second difference counts
         avar, share = lanes.sum(axis=1) / (2.0 * all_m * all_m * terms), extra.sum(axis=1) / (2.0 * all_m * terms)
     excess = np.empty(all_m.size)
-    subtract_excess(all_m, within.order, within.first, within.weights, share, avar, excess)
+    subtract_excess(all_m, within.order, within.first, within.weights, share[:, None], avar[:, None], excess[:, None])
     return AllanVariances(avar[: m.size], terms[: m.size], excess[: m.size])
 
 

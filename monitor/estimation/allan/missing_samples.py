@@ -114,7 +114,7 @@ def _weights_of_grid(m: Floats) -> Floats:
 def subtract_excess(
     factors: Ints, order: Ints, first: Ints, weights: Floats, share: Floats, avar: Floats, excess: Floats
 ) -> None:
-    """Subtract the contribution e V of missing samples from the mean squares of one axis.
+    """Subtract the contribution e V of missing samples from the mean squares.
 
     If an Allan variance that V needs is not known, white noise is assumed at this cluster size.
 
@@ -122,31 +122,30 @@ def subtract_excess(
     ----------
     factors, order, first, weights
         Fields of ``VarianceWithinClusters``.
-    share : ndarray of float64, shape (R,)
-        The factor e.
-    avar : ndarray of float64, shape (R,)
+    share : ndarray of float64, shape (R, k)
+        The factor e of k axes.
+    avar : ndarray of float64, shape (R, k)
         On input, half the mean square of the differences; NaN if no difference counts. On output, Allan variance.
-    excess : ndarray of float64, shape (R,)
+    excess : ndarray of float64, shape (R, k)
         Output array for the subtracted contribution.
     """
-    within, known = np.zeros(order.size), 0.0
+    axes = avar.shape[1]
+    within, known = np.zeros((order.size, axes)), np.full(axes, np.nan)
     for p in range(order.size):
-        i = order[p]
-        raw, corrected = avar[i], avar[i]
-        if raw == raw:
-            if share[i] != 0.0:
-                corrected -= share[i] * within[p]
-                if weights[p, p] != 0.0:
-                    corrected /= 1.0 + share[i] * weights[p, p]
-            known = corrected
-        elif p > first[p]:
-            known *= factors[order[p - 1]] / factors[i]
-        else:
-            known = _white_noise_level(factors, order, first, avar, p)
-        excess[i], avar[i] = (raw - corrected if raw == raw else 0.0), corrected
-        if known == known:
-            for r in range(p, order.size):
-                within[r] += weights[p, r] * known
+        i, own = order[p], weights[p, p]
+        ratio = factors[order[p - 1]] / factors[i] if p > first[p] else np.nan
+        for axis in range(axes):
+            raw = avar[i, axis]
+            avar[i, axis] = (raw - share[i, axis] * within[p, axis]) / (1.0 + share[i, axis] * own)
+            known[axis] = avar[i, axis] if raw == raw else known[axis] * ratio
+            excess[i, axis] = raw - avar[i, axis] if raw == raw else 0.0
+        if p == first[p]:
+            for axis in range(axes):
+                if known[axis] != known[axis]:
+                    known[axis] = _white_noise_level(factors, order, first, avar[:, axis], p)
+        for r in range(p, order.size):
+            for axis in range(axes):
+                within[r, axis] += weights[p, r] * known[axis] if known[axis] == known[axis] else 0.0
 
 
 @inlined

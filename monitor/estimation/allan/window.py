@@ -32,6 +32,7 @@ from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
     LAST_MISSING,
+    LAST_PARTIAL,
     LINE,
     MAX_PHASE_STEP,
     NEWEST,
@@ -182,7 +183,7 @@ class AllanWindow:
         self._terms[:], self._excess[:] = 0, 0
         self._sums[:] = self._rest[:] = 0.0
         self._scaling[:LANES], self._scaling[LANES:] = self._scale, 0.0
-        self._state[[TOTAL, LAST_MISSING, WIDTH]] = (0, -(1 << 62), LANES)
+        self._state[[TOTAL, LAST_MISSING, LAST_PARTIAL, WIDTH]] = (0, -(1 << 62), -(1 << 62), LANES)
 
     def append_samples(self, values: Floats) -> None:
         """Append samples to the window. If the window is full, the oldest samples are removed.

@@ -16,12 +16,12 @@ from monitor.estimation.allan.missing_samples import MIN_PRESENT_SHARE, min_pres
 AXES: Final = 6
 LANES: Final = 8
 """Number of columns per sample: six axes and two columns of padding."""
-TOTAL, NEWEST, LAST_MISSING, WIDTH = 0, 1, 2, 3
+TOTAL, NEWEST, LAST_MISSING, WIDTH, LAST_PARTIAL = 0, 1, 2, 3, 4
 """Indices of the elements of the state array.
 
 The elements are the number of samples since the last reset, the row of the newest phase point, the number of the newest
-missing sample, and ``LANES``. The compiled code reads ``LANES`` from the array, because a loop of constant length would
-not be vectorized.
+missing sample, ``LANES``, and the number of the newest sample that is missing on some axes only. The compiled code
+reads ``LANES`` from the array, because a loop of constant length would not be vectorized.
 """
 RUN_SAMPLES: Final = 64
 """Maximum number of samples whose phase is stored before the sums of squared differences are updated."""
@@ -59,7 +59,7 @@ class WindowBuffers(NamedTuple):
 class WindowArrays(NamedTuple):
     """Views of the data of a sliding window with m cluster sizes."""
 
-    state: Ints  # [LANES] elements at the indices ``TOTAL``, ``NEWEST``, ``LAST_MISSING`` and ``WIDTH``
+    state: Ints  # [LANES] elements at the indices ``TOTAL`` to ``LAST_PARTIAL``
     factors: Ints  # [m] cluster sizes in samples
     spans: Ints  # [m] number of newest samples that are used at each cluster size
     terms: Ints  # [m · LANES] number of second differences in each sum
@@ -145,13 +145,17 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
         done += run
         count = state[TOTAL] - run  # number of samples before this run of samples
         whole = count - state[LAST_MISSING] > length
-        if run == 1 and whole and count >= length:
+        shared = count - state[LAST_PARTIAL] > length
+        if run == 1 and shared and count >= length:
             for row in range(0, taus, RUN_SAMPLES):
                 some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
-                _replace_terms(first, factors[some], spans[some], phase, scratch, sums[lanes], rest[lanes])
+                _replace_terms(
+                    first, whole, factors[some], spans[some], phase, missing, scratch, terms[lanes], excess[lanes],
+                    sums[lanes], rest[lanes],
+                )  # fmt: skip
         else:
             _add_run(
-                first, run, count, whole, factors, spans, phase, missing, scratch, terms, excess, sums, rest,
+                first, run, count, whole, shared, factors, spans, phase, missing, scratch, terms, excess, sums, rest,
                 state[WIDTH],
             )  # fmt: skip
 
@@ -162,6 +166,7 @@ def _add_run(
     run: int,
     count: int,
     whole: bool,
+    shared: bool,
     factors: Ints,
     spans: Ints,
     phase: Ints,
@@ -184,7 +189,7 @@ def _add_run(
             leaving = count + row >= spans[i]
             end = run if leaving else min(run, spans[i] - count)
             row += _slide(
-                now, end - row, factors[i], spans[i], leaving, whole,
+                now, end - row, factors[i], spans[i], leaving, whole, shared,
                 phase, missing, scratch, terms[own], excess[own], sums[own], rest[own], lanes,
             )  # fmt: skip
 
@@ -204,6 +209,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
     now = before + LANES if before + LANES < phase.size else 0
     state[TOTAL] += 1
     state[NEWEST] = now // LANES
+    lost = 0
     for lane in range(sample.size):
         y = sample[lane] * scaling[lane] + scaling[LANES + lane]
         if abs(y) < MAX_PHASE_STEP:  # also false for NaN
@@ -214,9 +220,13 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
         else:
             phase[now + lane] = phase[before + lane]
             count = wrap_count(np.int64(missing[before + lane]) + 1)
-            state[LAST_MISSING] = state[TOTAL]
+            lost += 1
         if missing[now + lane] != count:  # Skipping writes of zeros saves memory.
             missing[now + lane] = count
+    if lost > 0:
+        state[LAST_MISSING] = state[TOTAL]
+        if lost < sample.size:
+            state[LAST_PARTIAL] = state[TOTAL]
 
 
 @compiled
@@ -227,6 +237,7 @@ def _slide(
     span: int,
     leaving: bool,
     whole: bool,
+    shared: bool,
     phase: Ints,
     missing: NDArray[np.int32],
     scratch: Floats,
@@ -253,9 +264,9 @@ def _slide(
     else:
         evicted[:n] = 0.0
     if not whole:
-        _replace_incomplete(phase, missing, now, new1, new2, m, run, 1, added, terms, excess)
+        _replace_incomplete(phase, missing, now, new1, new2, m, run, 1, shared, added, terms, excess, 0)
         if leaving:
-            _replace_incomplete(phase, missing, old0, old1, old2, m, run, -1, evicted, terms, excess)
+            _replace_incomplete(phase, missing, old0, old1, old2, m, run, -1, shared, evicted, terms, excess, 0)
     elif not leaving:
         terms += run
     _exchange(added, evicted, n, sums, rest, lanes)
@@ -300,75 +311,53 @@ def _replace_incomplete(
     m: int,
     rows: int,
     step: int,
+    shared: bool,
     squares: Floats,
     terms: Ints,
     excess: Ints,
+    own: int,
 ) -> None:
     """Replace the squares of differences with missing samples, and add the terms ``step`` times to the counts.
 
-    The square is zero if too few samples of a cluster are present. Usually, the same samples are missing on all axes,
-    so the number of missing samples is compared once for all axes, and the divisions are repeated only if it changes.
+    The squares, the counts and the sums of this τ begin at the index ``own``. The square is zero if too few samples of
+    a cluster are present. If ``shared`` is True, the same samples are missing on all axes.
     """
-    most, older, newer, extra = m - min_present(m), 0, 0, 0
-    share_a = share_b = 1.0 / m
-    shared_terms, shared_excess = 0, 0
-    lanes = np.uintp(LANES)
-    for row in range(rows):
-        i0, i1, i2 = np.uintp(at0 + row) * lanes, np.uintp(at1 + row) * lanes, np.uintp(at2 + row) * lanes
-        out = np.uintp(row) * lanes
-        a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
-        if _all_axes_lack(missing, i0, i1, i2, a, b):
+    most, lanes, together, begin = m - min_present(m), np.uintp(LANES), np.uintp(AXES if shared else 1), np.uintp(own)
+    for first in range(np.uintp(0), np.uintp(AXES), together):
+        older, newer, extra, counted, added = 0, 0, 0, 0, 0
+        share_a = share_b = 1.0 / m
+        for row in range(rows):
+            i0, i1 = np.uintp(at0 + row) * lanes + first, np.uintp(at1 + row) * lanes + first
+            i2, out = np.uintp(at2 + row) * lanes + first, begin + np.uintp(row) * lanes + first
+            a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
+            if a > most or b > most:
+                for lane in range(together):
+                    squares[out + lane] = 0.0
+                continue
+            counted += 1
             if a == 0 and b == 0:
-                shared_terms += step
-                continue
-            if a > most or b > most:
-                squares[out : out + lanes] = 0.0
                 continue
             if a != older or b != newer:
-                older, newer = a, b
-                share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
-                extra = step * _excess_of_term(a, b, share_a, share_b)
-            shared_terms += step
-            shared_excess += extra
-            for lane in range(lanes):
-                x1 = phase[i1 + lane]
-                d = (
-                    difference_of_means(x1 - phase[i2 + lane], phase[i0 + lane] - x1, m - a, m - b, share_a, share_b)
-                    * m
-                )
-                squares[out + lane] = d * d
-            continue
-        for lane in range(np.uintp(AXES)):
-            a = missing_between(missing[i1 + lane], missing[i2 + lane])
-            b = missing_between(missing[i0 + lane], missing[i1 + lane])
-            if a > most or b > most:
-                squares[out + lane] = 0.0
-                continue
-            if a != older or b != newer:
-                older, newer = a, b
-                share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
-                extra = step * _excess_of_term(a, b, share_a, share_b)
-            terms[lane] += step
-            excess[lane] += extra
-            if a != 0 or b != 0:
+                older, newer, share_a, share_b = a, b, 1.0 / (m - a), 1.0 / (m - b)
+                extra = _excess_of_term(a, b, share_a, share_b)
+            added += extra
+            for lane in range(together):
                 x0, x1, x2 = phase[i0 + lane], phase[i1 + lane], phase[i2 + lane]
-                d = difference_of_means(x1 - x2, x0 - x1, m - a, m - b, share_a, share_b) * m
+                d = _scaled_difference(x0, x1, x2, m, m - a, m - b, share_a, share_b)
                 squares[out + lane] = d * d
-    for lane in range(np.uintp(AXES)):
-        terms[lane] += shared_terms
-        excess[lane] += shared_excess
+        for lane in range(begin + first, begin + first + together):
+            terms[lane] += step * counted
+            excess[lane] += step * added
 
 
 @inlined
-def _all_axes_lack(
-    missing: NDArray[np.int32], i0: np.uintp, i1: np.uintp, i2: np.uintp, older: int, newer: int
-) -> bool:
-    """Return True if the same numbers of samples are missing in the two clusters on all axes."""
-    differs = 0
-    for lane in range(np.uintp(1), np.uintp(AXES)):
-        differs |= missing_between(missing[i1 + lane], missing[i2 + lane]) ^ older
-        differs |= missing_between(missing[i0 + lane], missing[i1 + lane]) ^ newer
-    return differs == 0
+def _scaled_difference(
+    phase0: int, phase1: int, phase2: int, m: int, older: int, newer: int, older_share: float, newer_share: float
+) -> float:
+    """Return m times the difference of the means of the present samples in two clusters, in integer units."""
+    if older == newer:
+        return float(phase0 - 2 * phase1 + phase2) * (m * older_share)
+    return m * difference_of_means(phase1 - phase2, phase0 - phase1, older, newer, older_share, newer_share)
 
 
 @inlined
@@ -419,9 +408,19 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 @compiled
 def _replace_terms(
-    now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats
+    now: int,
+    whole: bool,
+    factors: Ints,
+    spans: Ints,
+    phase: Ints,
+    missing: NDArray[np.int32],
+    scratch: Floats,
+    terms: Ints,
+    excess: Ints,
+    sums: Floats,
+    rest: Floats,
 ) -> None:
-    """Update the sums of all τ with a single new sample, for a full window without missing samples.
+    """Update the sums of all τ with a single new sample, for a full window without samples that only some axes lack.
 
     A single loop over all averaging times is faster than an array operation for each averaging time.
     """
@@ -429,16 +428,19 @@ def _replace_terms(
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
     at0 = np.uintp(now * LANES)
     for i in range(factors.size):
-        m, old = factors[i], now - spans[i] - 1
-        at1, at2 = np.uintp(ring_row(now - m, places) * LANES), np.uintp(ring_row(now - 2 * m, places) * LANES)
-        old0, old1 = np.uintp(ring_row(old + 2 * m, places) * LANES), np.uintp(ring_row(old + m, places) * LANES)
-        old2 = np.uintp(ring_row(old, places) * LANES)
-        out = np.uintp(i * LANES)
+        m, old, own = factors[i], now - spans[i] - 1, i * LANES
+        new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
+        first, middle, last = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
+        at1, at2, out = np.uintp(new1 * LANES), np.uintp(new2 * LANES), np.uintp(own)
+        old0, old1, old2 = np.uintp(first * LANES), np.uintp(middle * LANES), np.uintp(last * LANES)
         for lane in range(np.uintp(AXES)):
             d = float(phase[at0 + lane] - 2 * phase[at1 + lane] + phase[at2 + lane])
             e = float(phase[old0 + lane] - 2 * phase[old1 + lane] + phase[old2 + lane])
             added[out + lane] = d * d
             evicted[out + lane] = e * e
+        if not whole:
+            _replace_incomplete(phase, missing, now, new1, new2, m, 1, 1, True, added, terms, excess, own)
+            _replace_incomplete(phase, missing, first, middle, last, m, 1, -1, True, evicted, terms, excess, own)
     n = factors.size * LANES
     _exchange(added, evicted, n, sums, rest, n)
 
@@ -462,7 +464,7 @@ def keep_newest(memory: Ints, taus: int, axis: int, n: int) -> None:
     oldest = ring_row(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[ring_row(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - DISCARDED - back
-    state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
+    state[LAST_MISSING] = state[LAST_PARTIAL] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
         _recompute_sum(w, i, axis, n)
 
@@ -481,7 +483,7 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
         d = float(phase[i0] - 2 * phase[i1] + phase[i2])
         if a != 0 or b != 0:
             share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
-            d = difference_of_means(phase[i1] - phase[i2], phase[i0] - phase[i1], m - a, m - b, share_a, share_b) * m
+            d = _scaled_difference(phase[i0], phase[i1], phase[i2], m, m - a, m - b, share_a, share_b)
             excess += _excess_of_term(a, b, share_a, share_b)
         s = total + d * d
         z = s - total
@@ -584,46 +586,41 @@ def copy_variances(memory: Ints, taus: int, avar: Floats, terms: Ints, excess: F
         Output array for the contributions of missing samples, which have been subtracted.
     """
     w = compiled_view_window_arrays(memory, taus)
-    work = np.empty((3, taus))
-    level, subtracted, share = work[0], work[1], work[2]
-    for axis in range(AXES):
-        compute_variances_of_axis(w, axis, taus, level, subtracted, share)
-        for i in range(taus):
-            avar[i, axis], terms[i, axis], excess[i, axis] = level[i], w.terms[i * LANES + axis], subtracted[i]
+    compute_variances(w, taus, avar, excess, np.empty((taus, AXES)))
+    for i in range(taus):
+        for axis in range(AXES):
+            terms[i, axis] = w.terms[i * LANES + axis]
 
 
 @inlined
-def compute_variances_of_axis(
-    w: WindowArrays, axis: int, rows: int, avar: Floats, excess: Floats, share: Floats
-) -> None:
-    """Compute the Allan variances of one axis for the first ``rows`` elements of ``w.order``.
+def compute_variances(w: WindowArrays, rows: int, avar: Floats, excess: Floats, share: Floats) -> None:
+    """Compute the Allan variances of all axes for the first ``rows`` elements of ``w.order``.
 
     Parameters
     ----------
     w : WindowArrays
         Data of the window with m cluster sizes.
-    axis : int
-        Index of the axis.
     rows : int
         Number of cluster sizes; a multiple of whole grids.
-    avar : ndarray of float64, shape (m,)
+    avar : ndarray of float64, shape (m, 6)
         Output array for the Allan variances in squared units of the axis.
-    excess : ndarray of float64, shape (m,)
+    excess : ndarray of float64, shape (m, 6)
         Output array for the contributions of missing samples, which have been subtracted.
-    share : ndarray of float64, shape (m,)
+    share : ndarray of float64, shape (m, 6)
         Memory for intermediate results.
     """
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
     factors, order, sums, rest, terms, extra = w.factors, w.order, w.sums, w.rest, w.terms, w.excess
-    taus, scale, complete = factors.size, w.scaling[axis], True
+    taus, scaling, complete = factors.size, w.scaling, True
     for p in range(rows):
         i = order[p]
-        at, unit = i * LANES + axis, factors[i] * scale
-        avar[i] = half_mean_square(sums[at] + rest[at], terms[at], extra[at], 2.0 * unit * unit)
-        excess[i] = share[i] = 0.0
-        if extra[at] != 0:
-            share[i] = 0.5 * EXCESS_UNIT * extra[at] / (float(factors[i]) * terms[at])
-            complete = False
+        for axis in range(AXES):
+            at, unit = i * LANES + axis, factors[i] * scaling[axis]
+            avar[i, axis] = half_mean_square(sums[at] + rest[at], terms[at], extra[at], 2.0 * unit * unit)
+            excess[i, axis] = share[i, axis] = 0.0
+            if extra[at] != 0:
+                share[i, axis] = 0.5 * EXCESS_UNIT * extra[at] / (float(factors[i]) * terms[at])
+                complete = False
     if not complete:
         subtract_excess(factors, order[:rows], w.first, w.weights.reshape(taus, taus), share, avar, excess)
 

@@ -39,7 +39,7 @@ from monitor.estimation.allan.window_kernel import (
     WindowBuffers,
     append_staged_samples,
     compiled_view_window_arrays,
-    compute_variances_of_axis,
+    compute_variances,
     integer_slope_from_thirds,
     mean_rate_slope,
 )
@@ -199,7 +199,7 @@ def _follow(
     memory, taus, window = buffers
     # Fields are copied to local variables, because each access to a field in a loop changes a reference count.
     counters, phase, missing, scaling, terms, slope = w.state, w.phase, w.missing, w.scaling, curves.terms, curves.slope
-    work = np.empty((3, taus))
+    work = np.empty((3, taus, AXES))
     grid = int(np.count_nonzero(w.first == 0))  # number of cluster sizes of the fit, and powers of two between them
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
@@ -242,9 +242,9 @@ def _follow(
 def _copy_curve(
     w: WindowArrays, grid: int, scale: SumsToVariances, curves: VariancesAndSlopesOfAxes, axis: int, length: int
 ) -> None:
-    work = np.empty((3, w.factors.size))
+    work = np.empty((3, w.factors.size, AXES))
     avar, excess, share = work[0], work[1], work[2]
-    compute_variances_of_axis(w, axis, grid, avar, excess, share)
+    compute_variances(w, grid, avar, excess, share)
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
         total, count = w.sums[at] + w.rest[at], w.terms[at]
@@ -252,8 +252,8 @@ def _copy_curve(
         scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * count)
         # Smaller sums can be caused by rounding alone, as in AllanWindow.avar.
         limit = MAX_ROUNDING_SQUARE if w.excess[at] != 0 else 1.0
-        curves.avar[axis, i] = total * scale.inverse[axis, i] - excess[i] if total > limit * count else 0.0
-        curves.excess[axis, i] = excess[i]
+        curves.avar[axis, i] = total * scale.inverse[axis, i] - excess[i, axis] if total > limit * count else 0.0
+        curves.excess[axis, i] = excess[i, axis]
         bend = mean_rate_slope(w.phase, w.missing, w.state[NEWEST], length, w.factors[i], axis)
         curves.slopes[axis, i] = bend / w.scaling[axis]
 
@@ -288,16 +288,15 @@ def _project(
 def _subtract_excess(w: WindowArrays, grid: int, maps: SolutionMaps, work: Floats, right: Floats) -> None:
     """Subtract the contribution of missing samples to the mean squares from the right-hand sides.
 
-    ``work`` [3, m] is memory for intermediate results.
+    ``work`` [3, m, 6] is memory for intermediate results.
     """
     avar, excess, share = work[0], work[1], work[2]
     rows, used = maps.rows, maps.used
+    compute_variances(w, grid, avar, excess, share)
     for axis in range(AXES):
-        if used[axis, 1] > used[axis, 0]:
-            compute_variances_of_axis(w, axis, grid, avar, excess, share)
-            for i in range(used[axis, 0], used[axis, 1]):
-                for a in range(NOISES):
-                    right[axis, a] -= rows[axis, i, a] * excess[i]
+        for i in range(used[axis, 0], used[axis, 1]):
+            for a in range(NOISES):
+                right[axis, a] -= rows[axis, i, a] * excess[i, axis]
 
 
 @inlined
