@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from monitor.common.loss_of_samples import NO_LOSS, LossOfSamples
 from monitor.common.unit_formatting import format_count
 
 MAX_PROBLEMS: Final = 3
@@ -31,6 +32,7 @@ class Health:
     moving: bool = False  # True while the device is in motion
     moved: int = 0  # number of samples during motion
     crossed: tuple[str, ...] = ()  # user limits that are crossed now, for example "gz N"
+    loss: LossOfSamples = NO_LOSS  # missing samples in the window
 
 
 def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, str], stuck: Sequence[str] = ()) -> str:

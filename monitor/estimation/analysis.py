@@ -15,6 +15,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints, SampleBlock
 from drivers.errors import NotReady
+from monitor.common.loss_of_samples import LossOfSamples
 from monitor.estimation import analysis_notes
 from monitor.estimation.allan.batch import (
     NO_PAUSES,
@@ -36,6 +37,7 @@ from monitor.estimation.detection.motion_detection import MotionEpisode, detect_
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
+from monitor.estimation.fit.interval_widening import FitWithInputs, loss_of_samples
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
     axes_contradicting_five_terms,
@@ -108,8 +110,9 @@ def analyze(
     if remove_motion:
         values, motions = _without_motion(values, rate)
         found = [*found, *analysis_notes.describe_motions(motions, rate, removed=True)]
-    curve, fitted, filters, cost = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes, pauses)
-    found = [*found, *cost]
+    curve, fitted, filters, loss = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes, pauses)
+    if loss.share > 0.0:
+        found = [*found, loss.describe()]
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
         curve, fitted.fitted, fitted.coefficients, fitted.k_or_r, poorly_fitted_axes=fitted.poorly_fitted_axes,
@@ -187,8 +190,8 @@ def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motio
 
 def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis, pauses: Ints
-) -> tuple[AllanCurve, Fit, list[LowPass | None], list[str]]:
-    """Fit the noise coefficients, and describe by how much missing samples widen the intervals."""
+) -> tuple[AllanCurve, Fit, list[LowPass | None], LossOfSamples]:
+    """Fit the noise coefficients, and compute by how much missing samples widen the intervals."""
     n = len(values)
     avar, terms, excess = overlapping_allan_variances(values, factors, each, pauses)
     columns, covariances = make_design_matrix(factors, rate_hz), covariance_table(n, factors)
@@ -203,12 +206,8 @@ def _fit_curve(
         else None
         for axis, contradicts in enumerate(axes_contradicting_five_terms(found))
     ]
-    cost: list[str] = []
-    if (terms < covariances.terms[:, None]).any() or excess.any():
-        whole = np.where(terms > 0, covariances.terms[:, None], 0)
-        complete = fit_coefficients(columns, covariances, replace(measured, terms=whole, excess=None))
-        cost = analysis_notes.describe_loss(values, found.coefficients, complete.coefficients)
+    loss = loss_of_samples(np.isnan(values).mean(axis=0), [FitWithInputs(columns, covariances, measured, found)])
     found, filters = refit_with_low_passes(columns, covariances, measured, found, filters)
     lo, hi = deviation_intervals(avar, found.edf, excess=excess)
     curve = AllanCurve(factors / rate_hz, factors, np.maximum(avar, 0.0), terms, found.edf, lo, hi, n, excess)
-    return curve, found, filters, cost
+    return curve, found, filters, loss

@@ -20,7 +20,7 @@ from monitor.estimation.detection.line_and_outlier_detection import (
 )
 from monitor.estimation.detection.motion_detection import MotionEpisode
 from monitor.estimation.fit.coefficient_fit import Fit
-from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.fit.least_squares import K, Q
 from monitor.estimation.fit.low_pass_search import LowPass
 
@@ -48,38 +48,8 @@ BELOW_WHITE_NOISE: Final = (
 MOTION_LEFT_IN: Final = "motion of the sensor may be the cause; --rest removes the samples in motion"
 UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be the cause"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
-MIN_WIDTH_RATIO: Final = 1.005
-"""Minimum ratio of the widths of two intervals that is reported."""
 MIN_DEPARTURE_RATIO: Final = 0.5
 """Minimum residual at which an averaging time is reported, relative to the largest residual of the axis."""
-
-
-def describe_loss(values: Floats, found: Coefficients, complete: Coefficients) -> list[str]:
-    """Describe which share of the samples is missing, and by how much wider the intervals are.
-
-    Axes without samples are left out. The width of each coefficient is that of the axis with the largest increase.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (n, 6)
-        Samples; NaN means missing.
-    found, complete : Coefficients
-        Coefficients, and those from the same Allan variances with the covariances of a complete recording.
-    """
-    share = np.isnan(values).mean(axis=0)
-    measured = share < 1.0
-    if not measured.any() or share[measured].max() == 0.0:
-        return []
-    estimated = (found.status == Status.ESTIMATED) & (complete.status == Status.ESTIMATED) & measured
-    wider = []
-    for row, symbol in enumerate(SYMBOLS):
-        if estimated[row].any():
-            width, least = (one.hi[row] - one.lo[row] for one in (found, complete))
-            ratio = (width[estimated[row]] / least[estimated[row]]).max()
-            if ratio >= MIN_WIDTH_RATIO:
-                wider.append(f"{symbol} {100.0 * (ratio - 1.0):.0f} %")
-    lost = f"{format_two_significant_digits(100.0 * float(share[measured].max()))} % of the samples are missing"
-    return [f"{lost}: intervals wider by {', '.join(wider)}" if wider else f"{lost}: intervals hardly wider"]
 
 
 def describe_unexplained_curve(

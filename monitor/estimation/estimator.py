@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, SampleBlock
 from drivers.errors import NotReady
+from monitor.common.loss_of_samples import LossOfSamples
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
 from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
@@ -33,6 +34,7 @@ from monitor.estimation.fit.coefficient_fit import (
     fit_coefficients,
     make_design_matrix,
 )
+from monitor.estimation.fit.interval_widening import FitWithInputs, loss_of_samples
 from monitor.estimation.fit.low_pass_search import (
     LowPass,
     axes_contradicting_five_terms,
@@ -94,6 +96,7 @@ class Estimator:
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
+        self._newest_fits: list[FitWithInputs] = []
         # For each axis: the fit inputs if the five noise terms do not explain the Allan variance, or None otherwise.
         self._contradicting: list[tuple[CovarianceTable, MeasuredVariancesAndSlopes] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
@@ -150,6 +153,7 @@ class Estimator:
         self._window.discard_samples()
         self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
+        self._newest_fits = []
         if self._refit is not None:
             self._refit.restart_all_fits()
 
@@ -251,6 +255,11 @@ class Estimator:
             self.get_estimate()
         return self.get_estimate()
 
+    def loss_of_samples(self) -> LossOfSamples:
+        """Return the share of missing samples in the window, and by how much they widen the intervals."""
+        lengths = np.minimum(self._lengths, self._window.samples_in_window)
+        return loss_of_samples(self._window.missing_samples(lengths) / np.maximum(lengths, 1), self._newest_fits)
+
     def step_slow_statistics(self) -> tuple[VarianceCurve, VarianceCurve] | None:
         """Run one step of the slow computations: total deviation, Hadamard deviation and search for a low-pass filter.
 
@@ -279,6 +288,7 @@ class Estimator:
         whole = [axis for axis, n in enumerate(lengths) if n == filled]
         groups = [axes for axes in (whole, *([axis] for axis, n in enumerate(lengths) if n < filled)) if axes]
         fits = []
+        self._newest_fits = []
         for axes in groups:
             table = self._tables.table_of_axis(axes[0], lengths[axes[0]], filled)
             columns = slice(None) if len(groups) == 1 else axes  # usually all axes, which need not be copied
@@ -288,6 +298,7 @@ class Estimator:
             )  # fmt: skip
             one = fit_coefficients(self._design, table, measured, start_theta=self._theta[:, columns])
             self._theta[:, columns] = one.theta
+            self._newest_fits.append(FitWithInputs(self._design, table, measured, one))
             for column, (axis, contradicts) in enumerate(zip(axes, axes_contradicting_five_terms(one), strict=True)):
                 self._contradicting[axis] = (table, measured.select_axis(column)) if contradicts else None
             low_passes = [self._low_passes[axis] for axis in axes]

@@ -133,6 +133,8 @@ class RemoteDevice:
         if crossed := self.status.crossed:
             more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
             found.append(f"limits exceeded: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
+        if self.status.loss.widens_intervals:
+            found.append(self.status.loss.describe())
         return "; ".join([*found, *self.disagreements])
 
     def update_from_message(self, message: Message) -> None:

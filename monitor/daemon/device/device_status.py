@@ -56,6 +56,7 @@ class DeviceStatus:
             moving=motion_and_change_monitor is not None and motion_and_change_monitor.is_moving,
             moved=motion_and_change_monitor.samples_in_motion if motion_and_change_monitor is not None else 0,
             crossed=worker.publisher.limits.coefficients_beyond_limits,
+            loss=worker.loss_of_samples(),
         )
 
     def build_health_of_failed_device(self, states: dict[str, str], memory_bytes: int) -> Health:

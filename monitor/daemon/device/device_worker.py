@@ -18,6 +18,7 @@ from drivers.links.base import BatchingLink, Link
 from drivers.links.replay_link import ReplayLink
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.device_health import Health
+from monitor.common.loss_of_samples import NO_LOSS, LossOfSamples
 from monitor.common.unexpected_errors import log_unexpected_error
 from monitor.daemon.device.device_status import DeviceStatus
 from monitor.daemon.device.pipeline import DevicePipeline
@@ -327,6 +328,11 @@ class DeviceWorker:
     def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and the temperatures [n] in °C, or None if the window is empty."""
         return None if self.restore.active else self.pipeline.copy_window_and_temperature()
+
+    def loss_of_samples(self) -> LossOfSamples:
+        """Return the missing samples of the window, unless the window is being rebuilt by another thread."""
+        estimator = self.pipeline.estimator
+        return NO_LOSS if estimator is None or self.restore.active else estimator.loss_of_samples()
 
     def replace_limits(self, device: Device) -> None:
         """Replace the user limits of the device. The states of unchanged limits are kept.

@@ -286,6 +286,12 @@ class AllanWindow:
         """Return the number of second differences [m, 6] that each Allan variance averages."""
         return self._terms[: self.factors.size, :AXES].copy()
 
+    def missing_samples(self, lengths: Ints) -> Ints:
+        """Return the number [6] of missing samples among the newest ``lengths`` [6] samples of each axis."""
+        oldest = (int(self._state[NEWEST]) - lengths) % (self._phase.size // LANES) * LANES + np.arange(AXES)
+        newest = int(self._state[NEWEST]) * LANES + np.arange(AXES)
+        return np.asarray((self._missing[newest] - self._missing[oldest]).astype(np.int64))  # the counts wrap around
+
     def newest_samples(self, axis: int, n: int) -> Floats:
         """Return up to n newest samples of one axis, reconstructed from the phase; NaN means missing.
 

@@ -15,6 +15,7 @@ from drivers.validation.number_ranges import RATE_HZ
 from monitor.common import topics
 from monitor.common.control_characters import remove_control_characters
 from monitor.common.device_health import Health
+from monitor.common.loss_of_samples import NO_LOSS, LossOfSamples
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.residual_alarm import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve, VarianceCurve
@@ -429,6 +430,9 @@ class StatusMessage(
     """Number of samples that were taken during motion."""
     crossed: tuple[str, ...] = ()
     """Limits that are crossed at present, for example ``gz N``."""
+    loss: LossOfSamples = NO_LOSS
+    """Share of the samples in the window that are missing (``share``, 0 to 1), and the relative increase of the width
+    of the interval of each coefficient that they cause (``wider``, by letter)."""
     text: str = ""
     """Description of a problem with the device, or an empty string."""
 
@@ -453,9 +457,11 @@ class StatusMessage(
         found = decode_message(cls, payload)
         outputs = {_clean(name): _clean(state) for name, state in list(found.outputs.items())[:MAX_OUTPUTS]}
         crossed = tuple(_clean(one) for one in found.crossed)
+        wider = {symbol: found.loss.wider[symbol] for symbol in SYMBOLS if symbol in found.loss.wider}
         return msgspec.structs.replace(
-            found, state=_clean(found.state), text=_clean(found.text), outputs=outputs, crossed=crossed
-        )
+            found, state=_clean(found.state), text=_clean(found.text), outputs=outputs, crossed=crossed,
+            loss=LossOfSamples(found.loss.share, wider),
+        )  # fmt: skip
 
     def to_health(self) -> Health:
         """Convert the message to a ``Health`` object."""

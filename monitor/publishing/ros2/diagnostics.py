@@ -118,6 +118,8 @@ def _sample_values(health: Health) -> Iterator[tuple[str, str]]:
     yield "received (samples)", str(health.received)
     yield "lost (samples)", str(health.lost)
     yield "bad (samples)", str(health.bad)
+    if health.loss.share > 0.0:
+        yield "missing samples", health.loss.describe()
     yield "moving", str(health.moving)
 
 

@@ -309,6 +309,16 @@ def test_lost_samples_occupy_the_window_and_a_long_loss_empties_it():
     assert harness.output.estimates[-1][1].curve.n == 40
 
 
+def test_status_states_the_missing_samples_of_the_window():
+    harness = WorkerHarness()
+    harness.push_samples(900)
+    harness.push_samples(1000, lost=100)
+    harness.process(1.0)
+    loss = harness.worker.status.build_health({}, 0).loss
+    assert loss.share == 0.05
+    assert loss.wider["N"] > 0.02
+
+
 def test_unusable_tau_is_reported_and_samples_are_still_published():
     harness = WorkerHarness(rate=1000.0, window_s=0.1, tau=(5.0,))
     harness.push_samples(300)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.common import topics
+from monitor.common.loss_of_samples import LossOfSamples
 from monitor.publishing import remote_device_states
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import CoefficientsMessage, ModelGapMessage, ResetReply, StatusMessage
@@ -160,6 +161,13 @@ def test_disagreement_with_the_model_is_a_problem() -> None:
         )
     )
     assert (remote_device.problems_first_rank(0.0), remote_device.describe_device_problems()) == (2, "")
+
+
+def test_loss_that_widens_the_intervals_is_described() -> None:
+    costly, cheap = LossOfSamples(0.012, {"N": 0.002, "K": 0.04}), LossOfSamples(1e-4, {"N": 2e-4})
+    said = "1.2 % of the samples are missing: intervals of K 4 % wider"
+    assert make_device(loss=costly).describe_device_problems() == said
+    assert not make_device(loss=cheap).describe_device_problems()
 
 
 def test_exceeded_limit_is_a_problem() -> None:

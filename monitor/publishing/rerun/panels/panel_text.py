@@ -69,6 +69,8 @@ def health_text(device: str, health: Health, about: str = "") -> str:
         f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
         f"overflowed **{health.overflowed:,}**"
     )
+    if health.loss.share > 0.0:
+        lines.append(health.loss.describe())
     memory = f"memory **{health.memory_bytes / 1e6:.0f} MB**"
     if health.latency_p50_s is not None:
         median, high = (format_milliseconds(one) for one in (health.latency_p50_s, health.latency_p99_s))

@@ -6,6 +6,7 @@ import numpy as np
 
 from drivers.data_types import Event
 from monitor.common.device_health import Health
+from monitor.common.loss_of_samples import LossOfSamples
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import MeasuredAndPredictedMean
 from monitor.drift.thermal.residual_alarm import PredictionInterval
@@ -117,6 +118,7 @@ def make_health() -> Health:
     return Health(
         "running", 99.98, 360_000, 3, 1, 2, 0.0025, None, 182_000_000,
         {"zenoh": "ok", "viewer": "stalled (3 dropped)"}, "too slow", 3600.5, 4, 5, True, 6, ("gz N", "ax B"),
+        LossOfSamples(0.012, {"N": 0.006, "K": 0.04}),
     )  # fmt: skip
 
 

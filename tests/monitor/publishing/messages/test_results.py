@@ -9,6 +9,7 @@ import pytest
 
 from drivers.data_types import AXES, Event
 from monitor.common import topics
+from monitor.common.loss_of_samples import NO_LOSS, LossOfSamples
 from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
 from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.total import compute_total_curve
@@ -243,8 +244,22 @@ def test_status_message_has_all_fields() -> None:
         "moving": False,
         "moved": 0,
         "crossed": [],
+        "loss": {"share": 0.0, "wider": {}},
         "text": "…",
     }
+
+
+def test_status_of_an_earlier_revision_states_no_loss() -> None:
+    sent = json.loads(StatusMessage.from_result("a", UNIX_S, 0, example_results.make_health()).encode())
+    del sent["loss"]
+    assert StatusMessage.decode(json.dumps(sent).encode()).to_health().loss == NO_LOSS
+
+
+def test_loss_of_samples_in_a_status_message() -> None:
+    loss = LossOfSamples(0.012, {"N": 0.006, "K": 0.04})
+    sent = json.loads(StatusMessage.from_result("a", UNIX_S, 0, example_results.make_health(loss=loss)).encode())
+    sent["loss"]["wider"]["\x1b[2J"] = 1.0
+    assert StatusMessage.decode(json.dumps(sent).encode()).to_health().loss == loss
 
 
 def test_reset_reply_has_a_text() -> None:
