@@ -222,7 +222,7 @@ def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[Varian
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]
-    total = compute_total_curve(values, rate_hz, theta, listed)
+    total = compute_total_curve(values, rate_hz, theta, listed, result.pauses)
     if short is not None and not np.size(short):
         return total, None
-    return total, compute_hadamard_curve(values, rate_hz, theta, short)
+    return total, compute_hadamard_curve(values, rate_hz, theta, short, result.pauses)

@@ -2,11 +2,12 @@
 
 import csv
 import gzip
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from drivers.data_types import Floats
+from drivers.data_types import Floats, Ints
 
 
 def nist_1000() -> Floats:
@@ -39,24 +40,45 @@ def mean_squares_with_gaps(y: Floats, m: int) -> tuple[float, int, float]:
     return (0.5 * float(np.mean(squares)), len(squares), float(np.mean(shares))) if squares else (np.nan, 0, np.nan)
 
 
-def avar_with_gaps(y: Floats, m: int) -> float:
-    """Return the Allan variance of rates with missing samples (NaN), corrected for the samples that are missing.
+def variance_within_clusters_with_gaps(y: Floats, m: int) -> float:
+    """Return the mean variance within clusters of m samples, from the corrected Allan variances at 1, 2, 4, … samples.
 
-    The variance within clusters follows from the corrected Allan variances at 1, 2, 4, … samples, and is interpolated
-    over the logarithm of m.
+    The variance is interpolated over the logarithm of m. White noise is assumed where no difference counts.
     """
     sigma2: list[float] = []  # corrected Allan variances at the powers of two
+    within = [0.0]
+    for octave in range(int(m - 1).bit_length()):
+        raw, count, share = mean_squares_with_gaps(y, 2**octave)
+        sigma2.append(raw - share * within[octave] if count or not octave else sigma2[-1] / 2.0)
+        within.append(2.0 ** (octave + 1) / (2.0 ** (octave + 1) - 1.0) * sum(sigma2) / 2.0)
+    return float(np.interp(np.log2(m), np.arange(len(within)), within))
 
-    def within(octave: int) -> float:
-        size = 2.0**octave
-        return size / (size - 1.0) * sum(sigma2[:octave]) / 2.0 if octave else 0.0
 
-    for octave in range(int(m).bit_length()):
-        raw, _, share = mean_squares_with_gaps(y, 2**octave)
-        sigma2.append(raw - share * within(octave))
-    octave = int(m).bit_length() - 1
-    if m == 2**octave:
-        return sigma2[octave]
-    part = np.log2(m) - octave
+def avar_with_gaps(y: Floats, m: int) -> float:
+    """Return the Allan variance of rates with missing samples (NaN), corrected for the samples that are missing."""
     raw, _, share = mean_squares_with_gaps(y, m)
-    return raw - share * ((1.0 - part) * within(octave) + part * within(octave + 1))
+    return raw - share * variance_within_clusters_with_gaps(y, m)
+
+
+def mean_square_of_contrasts_with_gaps(
+    y: Floats, contrasts: Sequence[Sequence[Ints]], weights: Sequence[float]
+) -> tuple[float, int, float]:
+    """Return the mean square of the differences that count, their number, and their mean excess for white noise.
+
+    A difference is the weighted sum of the means of clusters, which are given as arrays of sample numbers. A sample may
+    occur several times. The excess is the variance of the difference for white noise of unit variance, minus the
+    variance if no samples are missing.
+    """
+    squares, excess = [], []
+    for clusters in contrasts:
+        parts = [own[np.isfinite(y[own])] for own in clusters]
+        if all(10 * part.size >= 6 * own.size for part, own in zip(parts, clusters, strict=True)):
+            squares.append(sum(w * y[part].mean() for w, part in zip(weights, parts, strict=True)) ** 2)
+            variances = []
+            for chosen in (parts, clusters):
+                of_samples = np.zeros(len(y))
+                for w, part in zip(weights, chosen, strict=True):
+                    np.add.at(of_samples, part, w / part.size)
+                variances.append(np.sum(of_samples**2))
+            excess.append(variances[0] - variances[1])
+    return (float(np.mean(squares)), len(squares), float(np.mean(excess))) if squares else (np.nan, 0, 0.0)

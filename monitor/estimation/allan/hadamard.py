@@ -6,8 +6,8 @@ sizes above a few samples, the ratio of the two variances is 10/9 for quantizati
 0.5 for random walk.
 
 The degrees of freedom are computed from the covariance of the third differences for the fitted mixture of noise terms.
-In contrast, the formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Third differences
-that contain a missing sample are left out.
+In contrast, the formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Clusters with
+missing samples are treated as described in ``missing_samples``.
 """
 
 from collections.abc import Sequence
@@ -18,17 +18,20 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octave_cluster_sizes
+from monitor.estimation.allan.batch import NO_PAUSES, octave_cluster_sizes
 from monitor.estimation.allan.curve import VarianceCurve
+from monitor.estimation.allan.missing_samples import min_present
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
     EstimatorMoments,
     PhaseRing,
     correct_bias_and_compute_intervals,
+    missing_between,
     phase_autocovariance,
     summation_nodes,
     variance_from_squared_differences,
 )
+from monitor.estimation.allan.window_kernel import difference_of_means
 
 SQUARED_WEIGHTS: Final = 6.0
 """Divisor in the definition of the Hadamard variance, which is the mean of d² / (6 m²) for third differences d."""
@@ -40,8 +43,8 @@ At a lag of 16 clusters, the squared correlation coefficient of third difference
 """
 
 
-def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the overlapping Hadamard variance of rates, and the number of averaged third differences.
+def hadamard_variance(values: Floats, factors: Ints, pauses: Ints = NO_PAUSES) -> tuple[Floats, Ints, Floats]:
+    """Return the overlapping Hadamard variance of rates and the number of averaged third differences.
 
     The parameters and results are those of ``total.total_variance``, but cluster sizes must not exceed n/3.
 
@@ -49,31 +52,39 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, add_hadamard_squares)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, add_hadamard_squares, pauses)
 
 
-def compute_hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> VarianceCurve:
+def compute_hadamard_curve(
+    values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None, pauses: Ints = NO_PAUSES
+) -> VarianceCurve:
     """Compute the Hadamard variance of a recording with confidence intervals.
 
     The parameters are those of ``total.compute_total_curve``, but cluster sizes must not exceed n/3.
     """
     n = len(values)
     factors = octave_cluster_sizes(n // 3) if factors is None else factors
-    raw_variance, terms = hadamard_variance(values, factors)
+    raw_variance, terms, excess = hadamard_variance(values, factors, pauses)
     return compute_hadamard_confidence_intervals(
-        [hadamard_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+        [hadamard_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms, excess
     )
 
 
 def compute_hadamard_confidence_intervals(
-    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+    moments: Sequence[EstimatorMoments],
+    rate_hz: float,
+    theta: Floats,
+    raw_variance: Floats,
+    terms: Ints,
+    excess: Floats,
 ) -> VarianceCurve:
     """Compute the degrees of freedom and confidence intervals of given Hadamard variances.
 
     The parameters are those of ``total.correct_total_variance``.
     """
-    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, raw_variance, terms)
-    return replace(curve, variance=raw_variance)  # the variance has no bias, even if the noise is unknown
+    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, raw_variance, terms, excess)
+    # the variance has no bias, even if the noise is unknown
+    return replace(curve, variance=np.maximum(raw_variance, 0.0))
 
 
 def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
@@ -106,7 +117,7 @@ def hadamard_estimator_moments(n: int, factor: int) -> EstimatorMoments:
 
 
 @compiled
-def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, extra: Floats, terms: Ints) -> None:
     """Add the squared third differences of phase at one cluster size to ``sums``.
 
     Parameters
@@ -117,6 +128,8 @@ def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> 
         Cluster size in samples.
     sums : ndarray of float64, shape (k,)
         Sum of squares of each axis, updated in place.
+    extra : ndarray of float64, shape (k,)
+        Sum of the excess of missing samples on each axis, updated in place, see ``AddSquares``.
     terms : ndarray of int64, shape (k,)
         Number of third differences of each axis, updated in place.
     """
@@ -126,6 +139,7 @@ def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> 
     whole = True
     for lane in range(sums.size):
         whole = whole and missing[first, lane] == missing[last, lane]
+    most = m - min_present(m)
     a, b, c, d = first % places, (first + m) % places, (first + 2 * m) % places, (first + 3 * m) % places
     for _ in range(n + 1 - 3 * m):
         u, v, w, x = np.uintp(a), np.uintp(b), np.uintp(c), np.uintp(d)
@@ -134,6 +148,22 @@ def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> 
                 e = float(phase[x, lane] - phase[u, lane] - 3 * (phase[w, lane] - phase[v, lane]))
                 sums[lane] += e * e
                 terms[lane] += 1
+                continue
+            older = missing_between(missing[u, lane], missing[v, lane])
+            middle = missing_between(missing[v, lane], missing[w, lane])
+            newer = missing_between(missing[w, lane], missing[x, lane])
+            if older > most or middle > most or newer > most:
+                continue
+            older_share, middle_share, newer_share = 1.0 / (m - older), 1.0 / (m - middle), 1.0 / (m - newer)
+            older_sum, middle_sum = phase[v, lane] - phase[u, lane], phase[w, lane] - phase[v, lane]
+            newer_sum = phase[x, lane] - phase[w, lane]
+            e = m * (
+                difference_of_means(middle_sum, newer_sum, m - middle, m - newer, middle_share, newer_share)
+                - difference_of_means(older_sum, middle_sum, m - older, m - middle, older_share, middle_share)
+            )
+            sums[lane] += e * e
+            extra[lane] += older * older_share + 4.0 * middle * middle_share + newer * newer_share
+            terms[lane] += 1
         a, b, c, d = a + 1, b + 1, c + 1, d + 1
         if a == places:
             a = 0

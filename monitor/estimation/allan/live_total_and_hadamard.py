@@ -8,7 +8,8 @@ The results are therefore slightly out of date. For 3.6 million samples and ten 
 takes 4.3 s. The values that ``curves_of_last_round`` returns are then up to 8.6 s old.
 
 Away from the reflected ends, the total variance and the Allan variance have the same second differences. The sums that
-the sliding window stores for an averaging time are therefore reused.
+the sliding window stores for an averaging time are therefore reused. The Allan variances of a round give the variance
+within clusters, from which the contribution of missing samples is computed.
 
 Averaging times at which a difference of integer phase could exceed 2⁶³ are left out, because the phase would overflow.
 Sums that are small enough to be caused by rounding alone are set to zero.
@@ -16,7 +17,7 @@ Sums that are small enough to be caused by rounding alone are set to zero.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,11 @@ from drivers.data_types import Floats, Ints
 from monitor.estimation.allan import hadamard, total
 from monitor.estimation.allan.batch import octave_cluster_sizes
 from monitor.estimation.allan.curve import VarianceCurve
+from monitor.estimation.allan.missing_samples import variance_within_clusters_from_octaves
 from monitor.estimation.allan.squared_difference_moments import (
     EstimatorMoments,
     PhaseRing,
-    compute_variance_from_squared_differences,
+    correct_squared_differences,
 )
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
@@ -37,17 +39,25 @@ MIN_SAMPLES: Final = 8
 """Minimum number of samples in the window from which the variances are computed."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02
 """Factor by which the number of samples must grow before the bias and the degrees of freedom are recomputed."""
-MAX_ROUNDING_SQUARE: Final = (9.0, 16.0)
+MAX_ROUNDING_SQUARE: Final = (25.0, 45.0)
 """Largest squared difference of the total and the Hadamard variance that rounding can cause, in squared units of phase.
 
-Each value is (Σ |w| / 2)², where w are the weights of the phase points in a difference.
+Each value is (Σ |w| / 2)², where w are the weights of the phase points in a difference if 40 % of each cluster are
+missing.
 """
+
+
+class _Sums(NamedTuple):
+    squares: Floats  # [6] sum of squared differences in squared units of phase
+    extra: Floats  # [6] sum of the excess of missing samples, see ``AddSquares``
+    terms: Ints  # [6] number of differences
 
 
 @dataclass(frozen=True, slots=True)
 class _Result:
     variance: Floats  # [6] variance in squared units of the axis, not corrected for bias
     terms: Ints  # [6] number of averaged differences
+    excess: Floats  # [6] contribution of missing samples, already subtracted from ``variance``
     moments: EstimatorMoments
 
 
@@ -71,6 +81,7 @@ class LiveTotalAndHadamard:
         self._window_resets = window.resets
         self._round = self._steps()
         self._last: tuple[list[_Result], list[_Result]] | None = None
+        self._allan = np.empty((0, AXES))  # Allan variances at 1, 2, 4, … samples of the current round
 
     def compute_next_tau(self) -> None:
         """Compute the total or Hadamard variance at the next averaging time.
@@ -112,6 +123,7 @@ class LiveTotalAndHadamard:
                 yield
                 continue
             sums: tuple[list[_Result], list[_Result]] = [], []
+            self._allan = np.empty((0, AXES))
             for m in totals:
                 sums[TOTAL].append(self._total(m))
                 yield
@@ -123,40 +135,49 @@ class LiveTotalAndHadamard:
                 yield
 
     def _total(self, m: int) -> _Result:
-        ring, unit = self._ring()
+        ring, _ = self._ring()
         n = ring.n
-        sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
+        sums = _Sums(np.zeros(AXES), np.zeros(AXES), np.zeros(AXES, np.int64))
+        begin, end = m, n - m + 1  # second differences that do not contain reflected samples
         inner = np.flatnonzero((self._window.factors == m) & (self._window.spans == self._window.length))
-        # the sums of the sliding window also contain clusters with missing samples
-        lost = ring.missing[(ring.first + n) % len(ring.missing)] - ring.missing[ring.first]
-        if inner.size and 2 * m <= n and np.isin(lost, (0, n)).all():
-            row = inner[0]
-            terms += self._window.term_counts()[row]
-            sums += np.nan_to_num(self._window.avar()[row]) * terms * 2.0 * (m / unit) ** 2
-            total.add_total_variance_squares(ring, m, 1, m, sums, terms)
-            total.add_total_variance_squares(ring, m, n - m + 1, n, sums, terms)
+        if inner.size:
+            for total_sum, part in zip(sums, self._window.squared_difference_sums(), strict=True):
+                total_sum += part[inner[0]]
+        elif begin < end:
+            total.add_total_variance_squares(ring, m, begin, end, *sums)
+        self._allan = np.concatenate([self._allan, [self._correct(TOTAL, m, sums)[0]]])
+        if begin < end:
+            total.add_total_variance_squares(ring, m, 1, begin, *sums)
+            total.add_total_variance_squares(ring, m, end, n, *sums)
         else:
-            total.add_total_variance_squares(ring, m, 1, n, sums, terms)
-        return self._result(TOTAL, n, m, sums, terms)
+            total.add_total_variance_squares(ring, m, 1, n, *sums)
+        return self._result(TOTAL, n, m, sums)
 
     def _hadamard(self, m: int) -> _Result:
         ring, _ = self._ring()
-        sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
-        hadamard.add_hadamard_squares(ring, m, sums, terms)
-        return self._result(HADAMARD, ring.n, m, sums, terms)
+        sums = _Sums(np.zeros(AXES), np.zeros(AXES), np.zeros(AXES, np.int64))
+        hadamard.add_hadamard_squares(ring, m, *sums)
+        return self._result(HADAMARD, ring.n, m, sums)
 
     def _ring(self) -> tuple[PhaseRing, Floats]:
         phase, missing, first, unit = self._window.view_phase_ring()
         return PhaseRing(phase, missing, first, self._window.samples_in_window), unit
 
-    def _result(self, statistic: int, n: int, m: int, sums: Floats, terms: Ints) -> _Result:
+    def _result(self, statistic: int, n: int, m: int, sums: _Sums) -> _Result:
+        variance, excess = self._correct(statistic, m, sums)
+        return _Result(variance, sums.terms, excess, self._cached_moments(statistic, n, m))
+
+    def _correct(self, statistic: int, m: int, sums: _Sums) -> tuple[Floats, Floats]:
+        """Return the variance [6] and the contribution of missing samples [6], which has been subtracted."""
         _, unit = self._ring()
-        sums[sums <= MAX_ROUNDING_SQUARE[statistic] * terms] = 0.0
-        weights = (total, hadamard)[statistic].SQUARED_WEIGHTS
-        variance = compute_variance_from_squared_differences(
-            (sums * unit**2)[None], terms[None], np.array([m]), weights
-        )[0]
-        return _Result(variance, terms, self._cached_moments(statistic, n, m))
+        squares = np.where(sums.squares <= MAX_ROUNDING_SQUARE[statistic] * sums.terms, 0.0, sums.squares) * unit**2
+        factor = np.array([m])
+        within = variance_within_clusters_from_octaves(self._allan, factor)
+        variance, excess = correct_squared_differences(
+            squares[None], sums.extra[None], sums.terms[None], factor,
+            (total, hadamard)[statistic].SQUARED_WEIGHTS, within,
+        )  # fmt: skip
+        return variance[0], excess[0]
 
     def _cached_moments(self, statistic: int, n: int, m: int) -> EstimatorMoments:
         known = self._moments[statistic].get(m)
@@ -169,5 +190,9 @@ class LiveTotalAndHadamard:
         return known
 
 
-def _stack(sums: list[_Result]) -> tuple[Floats, Ints]:
-    return np.stack([one.variance for one in sums]), np.stack([one.terms for one in sums])
+def _stack(sums: list[_Result]) -> tuple[Floats, Ints, Floats]:
+    return (
+        np.stack([one.variance for one in sums]),
+        np.stack([one.terms for one in sums]),
+        np.stack([one.excess for one in sums]),
+    )

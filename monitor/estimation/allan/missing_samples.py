@@ -110,6 +110,32 @@ def _weights_of_grid(m: Floats) -> Floats:
     return np.stack([np.interp(log_m, log_octaves, column) for column in within.T])
 
 
+def variance_within_clusters_from_octaves(avar: Floats, factors: Ints) -> Floats:
+    """Return the variance V within clusters [m, k], computed from Allan variances at powers of two.
+
+    The variance within clusters of another size is interpolated between powers of two. If an Allan variance is not
+    known, white noise is assumed at this cluster size.
+
+    Parameters
+    ----------
+    avar : ndarray of float64, shape (j, k)
+        Allan variances at 1, 2, 4, … samples; NaN means unknown.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples, up to 2^j.
+
+    >>> white = np.array([[1.0], [0.5], [np.nan]])
+    >>> variance_within_clusters_from_octaves(white, np.array([1, 2, 3, 8])).ravel().tolist()
+    [0.0, 1.0, 1.0, 1.0]
+    """
+    known = avar.copy()
+    for j in range(1, len(known)):
+        known[j] = np.where(np.isnan(known[j]), 0.5 * known[j - 1], known[j])
+    octaves = np.exp2(np.arange(len(known) + 1.0))
+    below = np.concatenate([np.zeros((1, avar.shape[1])), 0.5 * np.cumsum(known, axis=0)])
+    within = below * (octaves / np.maximum(octaves - 1.0, 1.0))[:, None]
+    return np.stack([np.interp(np.log2(factors), np.log2(octaves), column) for column in within.T], axis=1)
+
+
 @inlined
 def subtract_excess(
     factors: Ints, order: Ints, first: Ints, weights: Floats, share: Floats, avar: Floats, excess: Floats

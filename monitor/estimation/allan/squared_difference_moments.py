@@ -21,8 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
+from monitor.common.compiled import inlined
+from monitor.estimation.allan.batch import octave_cluster_sizes, overlapping_allan_variances
 from monitor.estimation.allan.curve import VarianceCurve
-from monitor.estimation.allan.uncertainty import deviation_intervals
+from monitor.estimation.allan.missing_samples import variance_within_clusters_from_octaves
+from monitor.estimation.allan.uncertainty import N, deviation_intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
 NUM_COEFFICIENTS: Final = 5
@@ -48,14 +51,23 @@ class PhaseRing(NamedTuple):
     """Ring buffer with at least n + 1 phase points for n samples."""
 
     phase: Floats | Ints  # [places, at least k] phase in floating point, or integer phase modulo 2⁶⁴
-    missing: NDArray[np.int32]  # [places, at least k] running count of missing samples
+    missing: NDArray[np.int32] | Ints  # [places, at least k] running count of missing samples, which may wrap around
     first: int  # row of the oldest phase point
     n: int  # number of samples
 
 
-def _integrate_to_phase(values: Floats) -> PhaseRing:
+AddSquares = Callable[[PhaseRing, int, Floats, Floats, Ints], None]
+"""Type of a function that adds the squared differences at one cluster size to sums [k].
+
+The function also adds the excess of missing samples to sums [k] and counts the differences [k]. Let a difference of
+cluster means have the variance a + e S² for white noise, where a is its variance if no samples are missing. The excess
+is m e.
+"""
+
+
+def _integrate_to_phase(values: Floats, pauses: Ints) -> PhaseRing:
     phase = np.zeros((len(values) + 1, values.shape[1]))
-    missing = np.zeros(phase.shape, np.int32)
+    missing = np.zeros(phase.shape, np.int64)
     rate = phase[1:]
     rate[:] = values
     absent = ~np.isfinite(rate)
@@ -64,14 +76,26 @@ def _integrate_to_phase(values: Floats) -> PhaseRing:
     rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
     rate[absent] = 0.0
     np.cumsum(rate, axis=0, out=rate)
-    np.cumsum(absent, axis=0, out=missing[1:])
+    missing[1:] = absent
+    missing[pauses + 1] = len(values)
+    np.cumsum(missing, axis=0, out=missing)
     return PhaseRing(phase, missing, 0, len(values))
 
 
+@inlined
+def missing_between(older: np.integer | int, newer: np.integer | int) -> int:
+    """Return the difference of two elements of the running count of missing samples, which may wrap around."""
+    count = int(newer) - int(older)
+    return count if count >= 0 else count + (1 << 32)
+
+
 def variance_from_squared_differences(
-    values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
-) -> tuple[Floats, Ints]:
+    values: Floats, factors: Ints, squared_weights: float, add_squares: AddSquares, pauses: Ints
+) -> tuple[Floats, Ints, Floats]:
     """Return a variance of rates, computed as a mean of squared phase differences, and the number of differences.
+
+    The third result is the contribution of missing samples, which has been subtracted from the mean squares. The
+    correction is described in ``missing_samples``.
 
     Parameters
     ----------
@@ -81,35 +105,55 @@ def variance_from_squared_differences(
         Cluster sizes in samples.
     squared_weights : float
         Divisor in the definition of the variance: 2 for second differences, 6 for third differences.
-    add_squares : callable
-        Function that adds the squared differences at one cluster size to sums [k], and counts these differences [k].
+    add_squares : AddSquares
+        Function that adds the squared differences at one cluster size.
+    pauses : ndarray of int64
+        Rows of missing samples that represent a pause of any length. No cluster that contains such a row counts.
     """
-    ring = _integrate_to_phase(values)
-    sums = np.zeros((factors.size, values.shape[1]))
+    ring = _integrate_to_phase(values, pauses)
+    sums, extra = np.zeros((2, factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
-        add_squares(ring, int(m), sums[i], terms[i])
-    return compute_variance_from_squared_differences(sums, terms, factors, squared_weights), terms
+        add_squares(ring, int(m), sums[i], extra[i], terms[i])
+    within = np.zeros_like(sums)
+    if extra.any():
+        octaves = octave_cluster_sizes(int(factors.max()))
+        within = variance_within_clusters_from_octaves(
+            overlapping_allan_variances(values, octaves, pauses=pauses).avar, factors
+        )
+    variance, excess = correct_squared_differences(sums, extra, terms, factors, squared_weights, within)
+    return variance, terms, excess
 
 
-def compute_variance_from_squared_differences(
-    sums: Floats, terms: Ints, factors: Ints, squared_weights: float
-) -> Floats:
-    """Convert sums of squared phase differences to variances.
+def correct_squared_differences(
+    sums: Floats, extra: Floats, terms: Ints, factors: Ints, squared_weights: float, within: Floats
+) -> tuple[Floats, Floats]:
+    """Convert sums of squared phase differences to variances, and subtract the contribution of missing samples.
 
     Parameters
     ----------
     sums : ndarray of float64, shape (m, k)
         Sums of squared phase differences.
+    extra : ndarray of float64, shape (m, k)
+        Sums of the excess of missing samples, see ``AddSquares``.
     terms : ndarray of int64, shape (m, k)
         Number of differences in each sum.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
     squared_weights : float
         Divisor in the definition of the variance: 2 for second differences, 6 for third differences.
+    within : ndarray of float64, shape (m, k)
+        Variance V within clusters.
+
+    Returns
+    -------
+    variance, excess : ndarray of float64, shape (m, k)
+        Corrected variance, which may be negative, and the contribution of missing samples.
     """
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
+        count = squared_weights * factors[:, None] * np.where(terms > 0, terms, np.nan)
+        excess = np.where(extra == 0.0, 0.0, extra / count * within)
+        return sums / (factors[:, None] * count) - excess, excess
 
 
 def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
@@ -128,7 +172,12 @@ def theta_in_sample_units(theta: Floats, rate_hz: float) -> Floats:
 
 
 def correct_bias_and_compute_intervals(
-    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+    moments: Sequence[EstimatorMoments],
+    rate_hz: float,
+    theta: Floats,
+    raw_variance: Floats,
+    terms: Ints,
+    excess: Floats | float = 0.0,
 ) -> VarianceCurve:
     """Correct measured variances for bias, and compute degrees of freedom and confidence intervals.
 
@@ -144,19 +193,25 @@ def correct_bias_and_compute_intervals(
         Measured variances that are not corrected for bias.
     terms : ndarray of int64, shape (m, k)
         Number of averaged squared differences.
+    excess : ndarray of float64, shape (m, k), or float
+        Contribution of missing samples that has been subtracted from the mean squares.
     """
     theta = theta_in_sample_units(theta, rate_hz)
-    mean = np.stack([one.mean for one in moments]) @ theta
+    means = np.stack([one.mean for one in moments])
+    mean = means @ theta
     allan = np.stack([one.allan for one in moments]) @ theta
-    square = np.einsum("ak,mab,bk->mk", theta, np.stack([one.covariance for one in moments]), theta)
+    noise = np.repeat(theta[:, None], len(moments), axis=1)
+    noise[N] += np.maximum(excess, 0.0) / means[:, N, None]  # missing samples act like white noise
+    level = np.einsum("ma,amk->mk", means, noise)
+    square = np.einsum("amk,mab,bmk->mk", noise, np.stack([one.covariance for one in moments]), noise)
     whole = np.array([one.terms for one in moments])[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        edf = np.where(raw_variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
-        corrected = raw_variance * (allan / mean)
+        edf = np.where(raw_variance + excess > 0.0, 2.0 * level * level / square * (terms / whole), np.nan)
+        ratio = allan / mean
     edf[~np.isfinite(edf)] = np.nan
-    lo, hi = deviation_intervals(corrected, edf)
+    lo, hi = deviation_intervals(raw_variance * ratio, edf, excess=excess * ratio)
     factors = np.array([one.factor for one in moments])
-    return VarianceCurve(factors / rate_hz, factors, corrected, terms, edf, lo, hi)
+    return VarianceCurve(factors / rate_hz, factors, np.maximum(raw_variance * ratio, 0.0), terms, edf, lo, hi)
 
 
 def phase_autocovariance(t: Floats) -> Floats:

@@ -15,8 +15,12 @@ to the same recording. Beyond T/2, nominal 95 % intervals would contain the true
 recordings.
 
 A linear drift R adds a known offset to every second difference. The square of the offset increases the mean, and the
-product of offset and noise reduces the degrees of freedom. Second differences that contain a missing sample are left
-out.
+product of offset and noise reduces the degrees of freedom.
+
+Missing samples are reflected like the other samples. A second difference counts if 60 % of the samples in each cluster
+of the extended recording are present, and the mean of a cluster is the mean of its present samples. The excess of
+missing samples (``missing_samples``) takes into account that samples near the ends occur twice in a cluster, or in both
+clusters.
 """
 
 from collections.abc import Sequence
@@ -24,23 +28,27 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled
-from monitor.estimation.allan.batch import octave_cluster_sizes
+from monitor.common.compiled import compiled, inlined
+from monitor.estimation.allan.batch import NO_PAUSES, octave_cluster_sizes
 from monitor.estimation.allan.curve import VarianceCurve
+from monitor.estimation.allan.missing_samples import min_present
 from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
     EstimatorMoments,
     PhaseRing,
     correct_bias_and_compute_intervals,
+    missing_between,
     phase_autocovariance,
     summation_nodes,
     variance_from_squared_differences,
 )
+from monitor.estimation.allan.window_kernel import difference_of_means
 
 MIN_SHARE: Final = 0.5
-"""Minimum share of the second differences that must be complete for a bias correction.
+"""Minimum share of the second differences that must count for a bias correction.
 
 Suppose that missing samples in the middle of a recording remove half of the second differences. In 3000 simulated
 recordings, the total variance was then 18 % too low for random walk and 21 % too high for quantization noise.
@@ -58,7 +66,7 @@ _RAMP: Final = NUM_COEFFICIENTS - 1
 """Index of the linear drift R in θ."""
 
 
-def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
+def total_variance(values: Floats, factors: Ints, pauses: Ints = NO_PAUSES) -> tuple[Floats, Ints, Floats]:
     """Return the total variance of rates without bias correction, and the number of averaged second differences.
 
     Parameters
@@ -67,21 +75,28 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
         Rates of k axes; non-finite values mean missing samples.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, below n.
+    pauses : ndarray of int64
+        Rows of missing samples that represent a pause of any length. No cluster that contains such a row counts.
 
     Returns
     -------
     tvar : ndarray of float64, shape (m, k)
-        Total variance in squared units of the axis, not corrected for bias.
+        Total variance in squared units of the axis, not corrected for bias. The variance may be negative if missing
+        samples contribute most of the mean square.
     terms : ndarray of int64, shape (m, k)
         Number of averaged second differences.
+    excess : ndarray of float64, shape (m, k)
+        Contribution of missing samples to the mean square, already subtracted from ``tvar``.
 
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms)
+    return variance_from_squared_differences(values, factors, SQUARED_WEIGHTS, _add_all_terms, pauses)
 
 
-def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> VarianceCurve:
+def compute_total_curve(
+    values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None, pauses: Ints = NO_PAUSES
+) -> VarianceCurve:
     """Compute the bias-corrected total variance of a recording with confidence intervals.
 
     Parameters
@@ -94,17 +109,24 @@ def compute_total_curve(values: Floats, rate_hz: float, theta: Floats, factors: 
         Fitted Q², N², B², K², R² in SI units; NaN means unknown.
     factors : ndarray of int64, shape (m,), or None
         Cluster sizes in samples, below n. None means powers of two.
+    pauses : ndarray of int64
+        Rows of missing samples that represent a pause of any length. No cluster that contains such a row counts.
     """
     n = len(values)
     factors = octave_cluster_sizes(n - 1) if factors is None else factors
-    raw_variance, terms = total_variance(values, factors)
+    raw_variance, terms, excess = total_variance(values, factors, pauses)
     return correct_total_variance(
-        [total_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms
+        [total_estimator_moments(n, int(m)) for m in factors], rate_hz, theta, raw_variance, terms, excess
     )
 
 
 def correct_total_variance(
-    moments: Sequence[EstimatorMoments], rate_hz: float, theta: Floats, raw_variance: Floats, terms: Ints
+    moments: Sequence[EstimatorMoments],
+    rate_hz: float,
+    theta: Floats,
+    raw_variance: Floats,
+    terms: Ints,
+    excess: Floats,
 ) -> VarianceCurve:
     """Correct given total variances for bias, and compute their degrees of freedom and confidence intervals.
 
@@ -120,9 +142,12 @@ def correct_total_variance(
         Total variances that are not corrected for bias.
     terms : ndarray of int64, shape (m, k)
         Number of averaged second differences.
+    excess : ndarray of float64, shape (m, k)
+        Contribution of missing samples that has been subtracted from the mean squares.
     """
     enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
-    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, np.where(enough, raw_variance, np.nan), terms)
+    raw_variance = np.where(enough, raw_variance, np.nan)
+    curve = correct_bias_and_compute_intervals(moments, rate_hz, theta, raw_variance, terms, excess)
     unsure = 2 * curve.factors > np.array([one.n for one in moments])
     curve.lo[unsure] = curve.hi[unsure] = np.nan
     return curve
@@ -231,13 +256,15 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
     return np.asarray(terms)
 
 
-def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, extra: Floats, terms: Ints) -> None:
     if m < ring.n:
-        add_total_variance_squares(ring, m, 1, ring.n, sums, terms)
+        add_total_variance_squares(ring, m, 1, ring.n, sums, extra, terms)
 
 
 @compiled
-def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
+def add_total_variance_squares(
+    ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, extra: Floats, terms: Ints
+) -> None:
     """Add the squares of a range of second differences of the extended phase to ``sums``.
 
     Parameters
@@ -250,9 +277,17 @@ def add_total_variance_squares(ring: PhaseRing, m: int, begin: int, end: int, su
         Range begin ≤ i < end of the middle phase points of the second differences.
     sums : ndarray of float64, shape (k,)
         Sum of squares of each axis, updated in place.
+    extra : ndarray of float64, shape (k,)
+        Sum of the excess of missing samples on each axis, updated in place, see ``AddSquares``.
     terms : ndarray of int64, shape (k,)
         Number of second differences of each axis, updated in place.
     """
+    phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
+    last = (first + n) % phase.shape[0]
+    for lane in range(sums.size):
+        if missing[first, lane] != missing[last, lane]:
+            _add_terms_with_missing(phase, missing, first, n, m, begin, end, sums, extra, terms)
+            return
     i = begin
     while i < end:
         stop = min(end, m) if i < m else end
@@ -268,24 +303,21 @@ def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms:
 
     A reflected phase point is twice the phase at the end of the recording minus the phase at the mirror point.
     """
-    phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
+    phase, first, n = ring.phase, ring.first, ring.n
     places = phase.shape[0]
     last = (first + n) % places
     before, behind = -1 if begin < m else 1, -1 if begin > n - m else 1
-    mirror, whole = np.empty(sums.size, phase.dtype), True
+    mirror = np.empty(sums.size, phase.dtype)
     for lane in range(sums.size):
         mirror[lane] = (1 - before) * phase[first, lane] + (1 - behind) * phase[last, lane]
-        whole = whole and missing[first, lane] == missing[last, lane]
     left, at = (first + abs(begin - m)) % places, (first + begin) % places
     right = (first + min(begin + m, 2 * n - m - begin)) % places
     for _ in range(end - begin):
         x, y, z = np.uintp(left), np.uintp(at), np.uintp(right)
-        old, new = x if before > 0 else np.uintp(first), z if behind > 0 else np.uintp(last)
         for lane in range(np.uintp(sums.size)):
-            if whole or missing[old, lane] == missing[new, lane]:
-                d = float(before * phase[x, lane] - 2 * phase[y, lane] + behind * phase[z, lane] + mirror[lane])
-                sums[lane] += d * d
-                terms[lane] += 1
+            d = float(before * phase[x, lane] - 2 * phase[y, lane] + behind * phase[z, lane] + mirror[lane])
+            sums[lane] += d * d
+            terms[lane] += 1
         left, at, right = left + before, at + 1, right + behind
         if left < 0:
             left += places
@@ -297,3 +329,82 @@ def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms:
             right += places
         elif right == places:
             right = 0
+
+
+@compiled
+def _add_terms_with_missing(
+    phase: Floats | Ints,
+    missing: NDArray[np.int32] | Ints,
+    first: int,
+    n: int,
+    m: int,
+    begin: int,
+    end: int,
+    sums: Floats,
+    extra: Floats,
+    terms: Ints,
+) -> None:
+    """Add the squares of second differences of the extended phase, some of which contain missing samples.
+
+    Near the ends, reflection makes a cluster contain samples twice, or both clusters contain the same samples. The
+    page ``docs/explanation/missing-samples.md`` states the excess of such differences.
+    """
+    places = phase.shape[0]
+    most = m - min_present(m)
+    last = _row(first, n, places)
+    older_share, newer_share, term, counted = 0.0, 0.0, 0.0, False
+    for i in range(begin, end):
+        left, right = i < m, i > n - m
+        a, b = abs(i - m), min(i + m, 2 * n - m - i)
+        x, y, z = _row(first, a, places), _row(first, i, places), _row(first, b, places)
+        # numbers of samples that occur twice or in both clusters if no samples are missing
+        twice = (min(a, i) if left else 0) + (n - max(b, i) if right else 0)
+        both = (max(i - b, 0) if right else 0) + (max(a - i, 0) if left else 0)
+        both += max(a - b, 0) if left and right else 0
+        complete = 2.0 + 2.0 * (twice - both) / m
+        before_a, before_i, before_b, before_n = -1, -1, -1, -1  # numbers of missing samples before each index
+        older, newer = 0, 0
+        for lane in range(sums.size):
+            start = missing[first, lane]
+            to_a, to_i = missing_between(start, missing[x, lane]), missing_between(start, missing[y, lane])
+            to_b, to_n = missing_between(start, missing[z, lane]), missing_between(start, missing[last, lane])
+            if to_a != before_a or to_i != before_i or to_b != before_b or to_n != before_n:
+                before_a, before_i, before_b, before_n = to_a, to_i, to_b, to_n
+                older = to_i + to_a if left else to_i - to_a
+                newer = 2 * to_n - to_i - to_b if right else to_b - to_i
+                counted = older <= most and newer <= most
+                if counted:
+                    older_share, newer_share = 1.0 / (m - older), 1.0 / (m - newer)
+                    present_a, present_i, present_b = a - to_a, i - to_i, b - to_b
+                    twice_a = min(present_a, present_i) if left else 0
+                    twice_b = n - to_n - max(present_b, present_i) if right else 0
+                    both = (max(present_i - present_b, 0) if right else 0) + (
+                        max(present_a - present_i, 0) if left else 0
+                    )
+                    both += max(present_a - present_b, 0) if left and right else 0
+                    term = (
+                        m
+                        * (
+                            (1.0 + 2 * twice_a * older_share) * older_share
+                            + (1.0 + 2 * twice_b * newer_share) * newer_share
+                            - 2 * both * older_share * newer_share
+                        )
+                        - complete
+                    )
+            if not counted:
+                continue
+            u, v, w = phase[x, lane], phase[y, lane], phase[z, lane]
+            older_sum = (v - phase[first, lane]) + (u - phase[first, lane]) if left else v - u
+            newer_sum = (phase[last, lane] - v) + (phase[last, lane] - w) if right else w - v
+            d = float(newer_sum - older_sum)
+            if older != 0 or newer != 0:
+                d = m * difference_of_means(older_sum, newer_sum, m - older, m - newer, older_share, newer_share)
+                extra[lane] += term
+            sums[lane] += d * d
+            terms[lane] += 1
+
+
+@inlined
+def _row(first: int, index: int, places: int) -> int:
+    """Return the row of a phase point in the ring buffer."""
+    return first + index if first + index < places else first + index - places

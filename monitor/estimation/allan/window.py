@@ -30,6 +30,7 @@ from drivers.errors import ConfigError
 from monitor.estimation.allan.missing_samples import AllanVariances, variance_within_clusters
 from monitor.estimation.allan.window_kernel import (
     AXES,
+    EXCESS_UNIT,
     LANES,
     LAST_MISSING,
     LAST_PARTIAL,
@@ -282,9 +283,21 @@ class AllanWindow:
         drift_slopes_by_axis_and_tau(self._memory, self._taus, lengths, slope, slopes)
         return slope, slopes.T
 
-    def term_counts(self) -> Ints:
-        """Return the number of second differences [m, 6] that each Allan variance averages."""
-        return self._terms[: self.factors.size, :AXES].copy()
+    def squared_difference_sums(self) -> tuple[Floats, Floats, Ints]:
+        """Return the sums from which the Allan variances are computed, each of shape (m, 6).
+
+        Returns
+        -------
+        squares : ndarray of float64
+            Sums of the squared second differences of integer phase.
+        extra : ndarray of float64
+            Sums of m/n_A + m/n_B − 2, where n_A and n_B samples of the two clusters are present.
+        terms : ndarray of int64
+            Numbers of second differences.
+        """
+        own = np.s_[: self.factors.size, :AXES]
+        extra = EXCESS_UNIT * self._excess.reshape(self._taus, LANES).astype(np.float64)
+        return (self._sums + self._rest)[own], extra[own], self._terms[own].copy()
 
     def missing_samples(self, lengths: Ints) -> Ints:
         """Return the number [6] of missing samples among the newest ``lengths`` [6] samples of each axis."""

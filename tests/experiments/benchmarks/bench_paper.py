@@ -219,7 +219,7 @@ def measure_fit_per_sample(length: int, taus: int, rounds: int) -> tuple[str, ..
         fitting.add_samples(samples)
     parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
     model, table_ = make_design_matrix(sizes, 1.0), covariances(length, sizes)
-    avar, terms, slope = window.avar(), window.term_counts(), window.drift_slopes_by_axis_and_tau()[0]
+    avar, terms, slope = window.avar(), window.variances().terms, window.drift_slopes_by_axis_and_tau()[0]
     took = time_alternately(
         {
             "kernel": make_loop(window.append_samples, [one.values for one in parts]),

@@ -96,13 +96,13 @@ def main() -> None:
         values = simulate_records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
         known, found = np.repeat(theta[:, None], arguments.records, axis=1), fit_noise(values)
-        tvar, terms = total_variance(values, factors)
+        tvar, terms, _ = total_variance(values, factors)
         totals = (
             correct_bias_and_compute_intervals(own, 1.0, known, tvar, terms),
             correct_bias_and_compute_intervals(own, 1.0, found, tvar, terms),
         )
         print_row(name, totals, np.stack([one.allan for one in own]) @ theta)
-        hvar, terms = hadamard_variance(values, thirds)
+        hvar, terms, _ = hadamard_variance(values, thirds)
         hadamards = (
             correct_bias_and_compute_intervals(other, 1.0, known, hvar, terms),
             correct_bias_and_compute_intervals(other, 1.0, found, hvar, terms),

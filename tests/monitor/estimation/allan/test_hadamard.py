@@ -9,14 +9,19 @@ from hypothesis import strategies as st
 
 from monitor.estimation.allan.hadamard import compute_hadamard_curve, hadamard_estimator_moments, hadamard_variance
 from monitor.estimation.allan.squared_difference_moments import phase_autocovariance
-from monitor.estimation.allan.total import total_estimator_moments
+from monitor.estimation.allan.total import total_estimator_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
-from tests.support.allan_references import columns, nist_1000
+from tests.support.allan_references import (
+    columns,
+    mean_square_of_contrasts_with_gaps,
+    nist_1000,
+    variance_within_clusters_with_gaps,
+)
 from tests.support.noise_series import draw_next_samples
 
 
 def test_nist_sp_1065_values_are_reproduced():
-    found, terms = hadamard_variance(nist_1000()[:, None], np.array([1, 10, 100]))
+    found, terms, _ = hadamard_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.943883e-01, 9.581083e-02, 3.237638e-02], abs=5e-8)
     assert terms.ravel().tolist() == [998, 971, 701]
 
@@ -28,7 +33,7 @@ def test_deviations_equal_allantools(kind, rate_hz):
     y = 1e2 * rng.standard_normal(900) + np.cumsum(rng.standard_normal(900))
     y = np.rint(y).astype(np.int64) if kind == "int" else y
     factors = np.array([1, 2, 3, 7, 50, 200, 299])
-    found, _ = hadamard_variance(y[:, None], factors)
+    found, _, _ = hadamard_variance(y[:, None], factors)
     _, expected, _, _ = allantools.ohdev(y, rate=rate_hz, data_type="freq", taus=factors / rate_hz)
     assert np.sqrt(found[:, 0]) == pytest.approx(expected, rel=1e-10)
 
@@ -36,26 +41,24 @@ def test_deviations_equal_allantools(kind, rate_hz):
 @settings(max_examples=60, deadline=None)
 @given(
     n=st.integers(1, 60),
-    m=st.integers(1, 22),
-    holes=st.sets(st.integers(0, 59), max_size=5),
+    m=st.integers(1, 20),
+    holes=st.sets(st.integers(0, 59), max_size=12),
     offset=st.sampled_from([0.0, 9.81, -300.0]),
     drift=st.sampled_from([0.0, 0.01]),
     scale=st.sampled_from([1e-4, 1.0, 1e3]),
     seed=st.integers(0, 99),
 )
-def test_variance_is_the_mean_over_three_clusters_without_missing_terms(n, m, holes, offset, drift, scale, seed):
-    rate = np.random.default_rng(seed).standard_normal(n)
+def test_variance_is_the_corrected_mean_over_three_clusters(n, m, holes, offset, drift, scale, seed):
+    rate = np.random.default_rng(seed).standard_normal(n) + drift * np.arange(n)
     rate[[h for h in holes if h < n]] = np.nan
-    found, terms = hadamard_variance((offset + scale * (rate + drift * np.arange(n)))[:, None], np.array([m]))
-    clusters = [rate[k : k + 3 * m].reshape(3, m).mean(axis=1) for k in range(n + 1 - 3 * m)]
-    squares = np.array([(a - 2.0 * b + c) ** 2 for a, b, c in clusters])
-    whole = ~np.isnan(squares)
-    assert terms[0, 0] == whole.sum()
-    if whole.any():
-        within = 1e-11 * (1.0 + (offset / scale) ** 2 * 1e-7)
-        assert found[0, 0] / scale**2 == pytest.approx(squares[whole].mean() / 6.0, rel=1e-7, abs=within)
-    else:
-        assert np.isnan(found[0, 0])
+    found, terms, excess = (one[0, 0] for one in hadamard_variance((offset + scale * rate)[:, None], np.array([m])))
+    clusters = [np.arange(k, k + 3 * m).reshape(3, m) for k in range(n + 1 - 3 * m)]
+    raw, count, share = mean_square_of_contrasts_with_gaps(rate, clusters, (1.0, -2.0, 1.0))
+    assert terms == count
+    expected = share / 6.0 * variance_within_clusters_with_gaps(rate, m) if share else 0.0
+    error = 1e-11 * (1.0 + (offset / scale) ** 2 * 1e-7)
+    assert excess / scale**2 == pytest.approx(expected, rel=1e-7, abs=error, nan_ok=True)
+    assert found / scale**2 == pytest.approx(raw / 6.0 - expected, rel=1e-7, abs=error, nan_ok=True)
 
 
 def test_large_linear_drift_has_no_effect():
@@ -122,11 +125,50 @@ def test_gaps_reduce_degrees_of_freedom_and_unknown_noise_gives_no_intervals():
     assert np.isfinite(whole.variance).all()
     assert np.isfinite(whole.hi[:, 0]).all()
     assert np.isnan(whole.hi[:, 1]).all()
-    values[100, 0] = np.nan
+    values[100:150, 0] = np.nan
     shorter = compute_hadamard_curve(values, 1.0, np.array([[0.0], [1.0], [0.0], [0.0], [0.0]]) * [1.0, 1.0])
-    np.testing.assert_allclose((shorter.edf / whole.edf)[:7, 0], (shorter.terms / whole.terms)[:7, 0])
-    assert np.isnan(shorter.hi[7, 0])  # no term is left
-    assert (shorter.terms[:, 0] == whole.terms[:, 0] - 3 * shorter.factors)[:5].all()
+    np.testing.assert_allclose((shorter.edf / whole.edf)[:2, 0], (shorter.terms / whole.terms)[:2, 0])
+    assert shorter.terms[0, 0] == whole.terms[0, 0] - 52
+    assert shorter.terms[7, 0] == whole.terms[7, 0]  # 61 % of the samples of a cluster are present
+    assert (shorter.edf < whole.edf)[:7, 0].all()
+
+
+@pytest.mark.parametrize("loss", ["random", "bursts"])
+@pytest.mark.parametrize("noise", ["white", "flicker", "random walk"])
+@pytest.mark.parametrize(("statistic", "longest"), [(hadamard_variance, 170), (total_variance, 511)])
+def test_missing_samples_cause_no_bias(statistic, longest, noise, loss):
+    """The bias is below 4 standard errors of its mean, or below a tenth of the standard deviation of one record."""
+    rng, n, records = np.random.default_rng(3), 512, 600
+    white = rng.standard_normal((n, records))
+    flicker = np.fft.rfft(rng.standard_normal((8 * n, records)), axis=0)
+    flicker[1:] /= np.sqrt(np.arange(1.0, len(flicker)))[:, None]
+    flicker[0] = 0.0
+    y = {"white": white, "flicker": np.fft.irfft(flicker, axis=0)[:n], "random walk": np.cumsum(white, axis=0)}[noise]
+    present = rng.random(y.shape) >= 0.05
+    if loss == "bursts":
+        present[:] = True
+        for axis in range(records):
+            for begin in rng.integers(0, n, 3):
+                present[begin : begin + 10, axis] = False
+    factors = np.append(2 ** np.arange(longest.bit_length()), longest)
+    complete, _, nothing = statistic(y, factors)
+    assert not nothing.any()
+    found, _, _ = statistic(np.where(present, y, np.nan), factors)
+    change = found - complete
+    error = np.nanstd(change, axis=1) / records**0.5
+    assert (np.abs(np.nanmean(change, axis=1)) < np.maximum(4.0 * error, 0.1 * complete.std(axis=1))).all()
+
+
+def test_no_cluster_contains_a_pause():
+    values, factors = np.random.default_rng(5).standard_normal((300, 1)), np.array([1, 8, 50])
+    values[150] = np.nan
+    for statistic, clusters in ((hadamard_variance, 3), (total_variance, 2)):
+        _, usual, excess = statistic(values, factors)
+        found, terms, nothing = statistic(values, factors, np.array([150]))
+        assert excess[1:].all()
+        assert (usual - terms)[1:, 0].tolist() == [clusters * 8, clusters * 50]
+        assert not nothing.any()
+        assert np.isfinite(found).all()
 
 
 # --- published results on real data
@@ -142,6 +184,6 @@ def test_stable32_values_are_reproduced(reference, data, table):
     else:
         y, within = columns(reference / "ocxo-frequency.csv.gz", "y")[0] / 1e7 - 1.0, 1.5e-3
     m, dev, n = columns(reference / f"{data}-stable32-{table}.csv", "m", "dev", "n")
-    found, terms = hadamard_variance(y[:, None], m.astype(np.int64))
+    found, terms, _ = hadamard_variance(y[:, None], m.astype(np.int64))
     assert np.sqrt(found[:, 0]) == pytest.approx(dev, rel=within)
     assert terms.ravel().tolist() == n.astype(int).tolist()

@@ -57,11 +57,13 @@ def test_curves_equal_the_batch_on_the_window(samples, factors):
 @given(
     samples=st.integers(MIN_SAMPLES, 400),
     holes=st.lists(st.tuples(st.integers(0, 399), st.integers(0, 5)), max_size=6),
+    loss=st.sampled_from([0.0, 0.02, 0.2]),
     skipped=st.integers(0, 30),
     seed=st.integers(0, 99),
 )
-def test_curves_equal_the_batch_with_gaps(samples, holes, skipped, seed):
+def test_curves_equal_the_batch_with_gaps(samples, holes, loss, skipped, seed):
     values = simulate_values(samples, seed)
+    values[np.random.default_rng(seed).random(samples) < loss] = np.nan
     for row, axis in holes:
         values[row % samples, axis] = np.nan
     window = AllanWindow(200, cluster_sizes(200, 1.0))
@@ -74,6 +76,14 @@ def test_curves_equal_the_batch_with_gaps(samples, holes, skipped, seed):
 def test_window_with_a_span_per_tau_gives_the_same_curves():
     values = simulate_values(900)
     window = AllanWindow(500, np.array([1, 4, 4, 16]), np.array([64, 100, 500, 200]))
+    window.append_samples(values)
+    check_against_batch(LiveTotalAndHadamard(window), window, values)
+
+
+def test_curves_with_random_loss_equal_the_batch():
+    values = simulate_values(700, 3)
+    values[np.random.default_rng(1).random(700) < 0.05] = np.nan
+    window = AllanWindow(500, cluster_sizes(500, 1.0))
     window.append_samples(values)
     check_against_batch(LiveTotalAndHadamard(window), window, values)
 

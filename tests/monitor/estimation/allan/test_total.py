@@ -12,16 +12,12 @@ from monitor.estimation.allan import squared_difference_moments as moments_modul
 from monitor.estimation.allan.batch import octave_cluster_sizes, overlapping_avar
 from monitor.estimation.allan.total import MIN_SHARE, compute_total_curve, total_estimator_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
-from tests.support.allan_references import nist_1000
+from tests.support.allan_references import (
+    mean_square_of_contrasts_with_gaps,
+    nist_1000,
+    variance_within_clusters_with_gaps,
+)
 from tests.support.noise_series import draw_next_samples
-
-
-def compute_reflected_differences(rate, m):
-    """Return D_k(m) of the reflected rate by its definition, NaN where a sample is missing."""
-    n = len(rate)
-    extended = np.concatenate([rate[::-1], rate, rate[::-1]])
-    sums = np.convolve(extended, np.ones(m), "valid") / m
-    return np.array([sums[n + i] - sums[n + i - m] for i in range(1, n)])
 
 
 def compute_difference_weights(n, m):
@@ -39,7 +35,7 @@ def compute_difference_weights(n, m):
 
 
 def test_nist_sp_1065_values_are_reproduced():
-    found, terms = total_variance(nist_1000()[:, None], np.array([1, 10, 100]))
+    found, terms, _ = total_variance(nist_1000()[:, None], np.array([1, 10, 100]))
     assert np.sqrt(found[:, 0]) == pytest.approx([2.922319e-01, 9.134743e-02, 3.406530e-02], abs=5e-8)
     assert terms.ravel().tolist() == [999, 999, 999]
 
@@ -51,7 +47,7 @@ def test_deviations_equal_allantools_up_to_the_longest_cluster(kind, rate_hz):
     y = 1e2 * rng.standard_normal(700) + np.cumsum(rng.standard_normal(700))
     y = {"float": y, "int": np.rint(y).astype(np.int64), "float32": y.astype(np.float32)}[kind]
     factors = np.array([1, 2, 3, 7, 100, 349, 350, 351, 352, 500, 698, 699])
-    found, _ = total_variance(y[:, None], factors)
+    found, _, _ = total_variance(y[:, None], factors)
     _, expected, _, _ = allantools.totdev(
         y.astype(float) if kind == "float32" else y, rate=rate_hz, data_type="freq", taus=factors / rate_hz
     )
@@ -62,34 +58,36 @@ def test_deviations_equal_allantools_up_to_the_longest_cluster(kind, rate_hz):
 @given(
     n=st.integers(2, 60),
     m=st.integers(1, 59),
-    holes=st.sets(st.integers(0, 59), max_size=5),
+    holes=st.sets(st.integers(0, 59), max_size=12),
     offset=st.sampled_from([0.0, 9.81, -300.0]),
     scale=st.sampled_from([1e-4, 1.0, 1e3]),
     seed=st.integers(0, 99),
 )
-def test_variance_is_the_mean_over_the_reflected_rate_without_missing_terms(n, m, holes, offset, scale, seed):
+def test_variance_is_the_corrected_mean_over_the_reflected_rate(n, m, holes, offset, scale, seed):
     rate = np.random.default_rng(seed).standard_normal(n)
     rate[[h for h in holes if h < n]] = np.nan
-    found, terms = total_variance((offset + scale * rate)[:, None], np.array([m]))
-    squares = compute_reflected_differences(rate, m) ** 2 if m < n else np.array([])
-    whole = ~np.isnan(squares)
-    assert terms[0, 0] == whole.sum()
-    if whole.any():
-        assert found[0, 0] / scale**2 == pytest.approx(0.5 * squares[whole].mean(), rel=1e-8, abs=1e-18 * offset**2)
-    else:
-        assert np.isnan(found[0, 0])
+    found, terms, excess = (one[0, 0] for one in total_variance((offset + scale * rate)[:, None], np.array([m])))
+    forward = np.arange(n)
+    extended = np.concatenate([forward[::-1], forward, forward[::-1]])
+    clusters = [(extended[n + i - m : n + i], extended[n + i : n + i + m]) for i in range(1, n)] if m < n else []
+    raw, count, share = mean_square_of_contrasts_with_gaps(rate, clusters, (-1.0, 1.0))
+    assert terms == count
+    expected = 0.5 * share * variance_within_clusters_with_gaps(rate, m) if share else 0.0
+    error = 1e-12 * (1.0 + (offset / scale) ** 2 * 1e-6)
+    assert excess / scale**2 == pytest.approx(expected, rel=1e-8, abs=error, nan_ok=True)
+    assert found / scale**2 == pytest.approx(0.5 * raw - expected, rel=1e-8, abs=error, nan_ok=True)
 
 
 def test_columns_are_independent_and_the_input_is_not_modified():
     values = np.random.default_rng(0).standard_normal((80, 3))
     values[:, 1], values[10, 2], values[11, 2] = np.nan, np.inf, -np.inf
     before = values.copy()
-    found, terms = total_variance(values, np.array([1, 5, 79]))
+    found, terms, _ = total_variance(values, np.array([1, 5, 79]))
     assert np.array_equal(values, before, equal_nan=True)
     assert np.isnan(found[:, 1]).all()
     assert terms[:, 0].tolist() == [79, 79, 79]
     for k in range(3):
-        alone, _ = total_variance(values[:, [k]], np.array([1, 5, 79]))
+        alone, _, _ = total_variance(values[:, [k]], np.array([1, 5, 79]))
         np.testing.assert_allclose(found[:, [k]], alone, rtol=1e-12)
 
 
@@ -180,7 +178,7 @@ def test_shortest_cluster_equals_the_allan_variance_and_the_grid_ends_below_the_
 
 def test_unknown_noise_or_too_few_terms_give_no_curve():
     values = np.random.default_rng(3).standard_normal((400, 2))
-    values[200, 1] = np.nan
+    values[100:280, 1] = np.nan
     theta = np.array([[0.0, 0.0], [np.nan, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     curve = compute_total_curve(values, 1.0, theta)
     assert np.isnan(curve.variance[:, 0]).all()
@@ -201,5 +199,5 @@ def test_stable32_values_of_phase_dat_are_reproduced(reference):
     with (reference / "phase-dat-stable32-totdev.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     factors = np.array([int(float(row["m"])) for row in rows])
-    found, _ = total_variance(np.diff(x)[:, None], factors)
+    found, _, _ = total_variance(np.diff(x)[:, None], factors)
     assert np.sqrt(found[:, 0]) == pytest.approx([float(row["dev"]) for row in rows], rel=5e-5)
