@@ -6,6 +6,10 @@ therefore does not depend on how the samples are distributed over calls.
 - **Haar differences.** In octave j, the means of two successive blocks of m = 2^j samples give the Haar difference z =
   (mean − mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, the
   differences are independent. The computation takes two additions per sample and axis.
+- **Missing samples.** The mean of a block is the mean of its samples that are present, if these are at least 60 %. The
+  expectation of z² is then σ²(m) + e V(m), with the symbols of ``allan.missing_samples``. V and σ² are taken from the
+  reference, and z² is divided by 1 + e V/σ². Loss therefore changes no variance. For white noise, V/σ² = m. If missing
+  samples cause most of z², as with a strong spectral line, z² is ignored.
 - **Evidence.** Let S be the sum of the n squares z² since the start of the reference, and S₁ the sum of the n₁ squares
   since a suspected change. The evidence g is the log-likelihood ratio of the hypotheses "variance multiplied by r" and
   "no change":
@@ -29,6 +33,7 @@ import numpy as np
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
+from monitor.estimation.allan.missing_samples import min_present
 
 AXES: Final = 6
 RATIOS: Final = np.array([1.2, 1.44, 2.25, 1 / 1.2, 1 / 1.44, 1 / 2.25])
@@ -70,6 +75,8 @@ MIN_BAND_TERMS: Final = 16
 """Minimum number of squared differences in a longer octave from which slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8
 """Minimum number of pairs of sums from which the factor F is estimated."""
+MIN_INFORMATION: Final = 0.5
+"""Minimum share of the expectation of z² that is not caused by missing samples. For white noise, the share is ≥ 0.6."""
 MAX_FLANK: Final = 12.0
 """Maximum ratio of the squared Haar differences before and after a step to the reference variance."""
 CONFIRM_PAIRS: Final = 2
@@ -85,7 +92,7 @@ UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
 """Columns of ``ChangeState.unit`` and ``ChangeState.cum``, which contain sums of squared differences."""
 N1, S1, SINCE, G = range(4)
 """Columns of ``ChangeState.cusum``, which contains the evidence for changes."""
-HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
+HELD, TERMS, SQUARES, COUNT, SPREAD = range(5)
 """Columns of ``ChangeState.spread``, from which the factor F is computed."""
 NOISE, BURST, STEP = 1.0, 2.0, 3.0
 """Kinds of alarms."""
@@ -108,7 +115,7 @@ class ChangeState(NamedTuple):
     stage: Floats  # [A, 32] samples of the current tick
     half: Floats  # [A, J, 2] sum and number of samples of the first block of a pair
     fill: Ints  # [A, J] number of complete block pairs for step detection; −1 excludes the current pair
-    ring: Floats  # [A, J, 2, 2] mean and difference of the last two block pairs
+    ring: Floats  # [A, J, 2, 3] mean, difference and information of the last two block pairs
     seeds: Floats  # [A, J, SEED] first squared Haar differences z²
     band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of values in ``seeds``, F
     unit: (
@@ -116,7 +123,7 @@ class ChangeState(NamedTuple):
     )
     cum: Floats  # [A, J, 5] columns of ``unit`` since the start
     cusum: Floats  # [A, J, 6, 4] n₁, S₁, time of the suspected change, evidence g
-    spread: Floats  # [A, J, L, 5] for the factor F: stored sum of z², 1 if stored, squared differences, pairs, F
+    spread: Floats  # [A, J, L, 5] for the factor F: stored sum of z², its terms or 0, squared differences, pairs, F
     burst: Floats  # [A, 2] CUSUM of extreme values, and the last sample at which it was zero
     alarm: Floats  # [A, 5] pending alarm, with the columns from KIND to DUE; kind 0 means no alarm
     step: Floats  # [A, 6] octave or −1, mean before and after, position, significance, number of remaining pairs
@@ -129,7 +136,7 @@ def make_change_state(octaves: int) -> ChangeState:
     a, j = AXES, octaves
     state = ChangeState(
         np.zeros(7), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
-        np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
+        np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 3)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
         np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 5)), np.zeros((a, 6)),
@@ -181,12 +188,9 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
     evidence = _count_extremes(sums, s.band, s.cum, s.burst, axis, now)
     if evidence > s.levels[H_BURST] and s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
         _alarm(s, axis, BURST, s.burst[axis, 1], evidence, now)
+    if count > 0.0:
+        _look_within_tick(s, axis, count == TICK_SAMPLES, now)
     h = s.levels[H_NOISE]
-    for j in range(SHORT):
-        _differences(sums, s.band, s.unit, s.seeds, axis, j)
-        best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, s.alarm, axis, j, now, h)
-        if best >= 0:
-            _suspect(s, axis, j, best, now)
     place = now // TICK_SAMPLES - 1
     for j in range(SHORT, s.half.shape[1]):
         if place & 1 == 0:
@@ -202,6 +206,24 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
             s.fill[axis, j] = 0
         total += s.half[axis, j, 0]
         count += s.half[axis, j, 1]
+
+
+@compiled
+def _look_within_tick(s: ChangeState, axis: int, complete: bool, now: int) -> None:
+    """Test the octaves whose blocks are shorter than a tick."""
+    sums = s.stage[axis]
+    present = np.ones(0 if complete else TICK_SAMPLES)
+    for i in range(present.size):
+        if sums[i] != sums[i]:
+            sums[i] = present[i] = 0.0
+    for j in range(SHORT):
+        if complete:
+            _differences(sums, s.band, s.unit, s.seeds, axis, j)
+        else:
+            _differences_of_present(sums, present, s.band, s.unit, s.seeds, axis, j)
+        best = _look(s.unit, s.cum, s.band, s.spread, s.cusum, s.alarm, axis, j, now, s.levels[H_NOISE])
+        if best >= 0:
+            _suspect(s, axis, j, best, now)
 
 
 @compiled
@@ -237,28 +259,66 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 
 @compiled
-def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
-    """Process a pair of blocks of 2^j samples.
+def _differences_of_present(
+    sums: Floats, present: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int
+) -> None:
+    """Add the squared Haar differences of one octave within a tick in which samples are missing.
 
-    The pair is ignored if more than 1/16 of the samples of a block are missing.
+    ``sums`` is used as in ``_differences``, with 0 for missing samples. ``present`` contains the numbers of samples in
+    the blocks.
     """
+    m, ratio = 1 << j, _variance_ratio_within(band, axis, j)
+    for i in range(TICK_SAMPLES >> (j + 1)):
+        sum1, sum2, count1, count2 = sums[2 * i], sums[2 * i + 1], present[2 * i], present[2 * i + 1]
+        sums[i], present[i] = sum1 + sum2, count1 + count2
+        information = _information(count1, count2, m, ratio)
+        if information >= MIN_INFORMATION:
+            d = sum2 / count2 - sum1 / count1
+            _gather(band, unit, seeds, axis, j, 0.5 * d * d * information)
+
+
+@compiled
+def _variance_ratio_within(band: Floats, axis: int, j: int) -> float:
+    """Return the ratio V/σ² of the variance within blocks of 2^j samples to the Allan variance, from the reference."""
+    m, total = 1 << j, 0.0
+    for i in range(j):
+        if band[axis, i, N] == 0.0:
+            return float(m)  # white noise, until the reference is known
+        total += 0.5 * band[axis, i, S] / band[axis, i, N]
+    if band[axis, j, S] <= 0.0 or j == 0:
+        return float(m)
+    return float(total * m / (m - 1.0) * band[axis, j, N] / band[axis, j, S])
+
+
+@compiled
+def _information(count1: float, count2: float, m: int, ratio: float) -> float:
+    """Return the factor 1 / (1 + e V/σ²) for the square of a difference between block means, 0 for too few samples."""
+    if min(count1, count2) < min_present(m):
+        return 0.0
+    return 1.0 / (1.0 + (0.5 * (1.0 / count1 + 1.0 / count2) - 1.0 / m) * ratio)
+
+
+@compiled
+def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
+    """Process a pair of blocks of 2^j samples, unless too many samples of a block are missing."""
     m = 1 << j
-    least = m - m // 16
     fill = s.fill[axis, j]
-    if count1 < least or count2 < least:
+    information = 1.0
+    if count1 + count2 < 2.0 * m:
+        information = _information(count1, count2, m, _variance_ratio_within(s.band, axis, j))
+    if information < MIN_INFORMATION:
         s.fill[axis, j] = 0
         return
     d = sum2 / count2 - sum1 / count1
     mean = (sum1 + sum2) / (count1 + count2)
-    # For white noise, the variance of d is proportional to 1/count1 + 1/count2.
-    z2 = d * d * count1 * count2 / ((count1 + count2) * m)
-    _gather(s.band, s.unit, s.seeds, axis, j, z2)
+    _gather(s.band, s.unit, s.seeds, axis, j, 0.5 * d * d * information)
     if s.step[axis, 0] == j:
         _confirm(s, axis, mean, now)
     elif fill == 2 and s.step[axis, 0] < 0.0 and s.alarm[axis, KIND] == 0.0:
-        _seek_step(s, axis, j, mean, d, now)
-    s.ring[axis, j, 0, 0], s.ring[axis, j, 0, 1] = s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1]
-    s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1] = mean, d
+        _seek_step(s, axis, j, mean, d, information, now)
+    for i in range(s.ring.shape[3]):
+        s.ring[axis, j, 0, i] = s.ring[axis, j, 1, i]
+    s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1], s.ring[axis, j, 1, 2] = mean, d, information
     s.fill[axis, j] = min(fill + 1, 2)
 
 
@@ -332,7 +392,7 @@ def _look(
     if unsettled and band[axis, j, N] >= SETTLED:
         band[axis, j, LIMIT] = CLIP * band[axis, j, S] / band[axis, j, N]
     best = _raise_cusums(cusum, band, axis, j, k, q, now, h)
-    if best < 0 and alarm[axis, KIND] == 0.0 and k == max(1, TICK_SAMPLES >> (j + 1)):
+    if best < 0 and alarm[axis, KIND] == 0.0:
         _feed_spread(spread, band, axis, j, q, k)
     return best
 
@@ -341,24 +401,25 @@ def _look(
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
     """Update the factor F of one octave.
 
-    The sums of z² over 1, 2, 4, … ticks are compared with the preceding sums of the same length. For each length, the
-    mean squared difference is divided by its expectation for independent Gaussian noise. F is the largest of these
-    ratios. A ratio that is not significantly above 1 is first reduced by its standard error.
+    The mean z² over 1, 2, 4, … ticks is compared with the preceding mean over the same time. For each length, the mean
+    squared difference is divided by its expectation for independent Gaussian noise. F is the largest of these ratios.
+    A ratio that is not significantly above 1 is first reduced by its standard error.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
-        if spread[axis, j, level, FULL] == 0.0:
-            spread[axis, j, level, HELD], spread[axis, j, level, FULL] = q, 1.0
+        held, terms = spread[axis, j, level, HELD], spread[axis, j, level, TERMS]
+        if terms == 0.0:
+            spread[axis, j, level, HELD], spread[axis, j, level, TERMS] = q, k
             return
-        held = spread[axis, j, level, HELD]
-        spread[axis, j, level, FULL] = 0.0
-        spread[axis, j, level, SQUARES] += (q - held) ** 2
+        spread[axis, j, level, TERMS] = 0.0
+        # the variance of the difference is 2 v² (1/k + 1/k')
+        spread[axis, j, level, SQUARES] += 0.5 * (q / k - held / terms) ** 2 * k * terms / (k + terms)
         spread[axis, j, level, COUNT] += 1.0
         count = spread[axis, j, level, COUNT]
         q += held
+        k += terms
         if count >= MIN_SPREAD_PAIRS and v > 0.0:
-            expected = 4.0 * k * (1 << level) * v * v * count
-            found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
+            found, error = spread[axis, j, level, SQUARES] / (v * v * count), np.sqrt(3.0 / count)
             if found < 1.0 + 2.0 * error:  # not significantly above 1
                 found /= 1.0 + error
             spread[axis, j, level, SPREAD] = found
@@ -474,22 +535,24 @@ def set_next_decision_sample(s: ChangeState) -> None:
 
 
 @compiled
-def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
+def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, information: float, now: int) -> None:
     """Search for a bias step between the newest pair of blocks and the second pair before it.
 
     A step is rejected if the sensor moves, or if a linear drift explains the difference of the means.
     """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
+    # The variance of each mean is inversely proportional to its information.
+    both = 2.0 * information * ring[0, 2] / (information + ring[0, 2])
     band = s.band[axis, j]
     if band[N] == 0.0 or j + 3 >= s.band.shape[1]:
         return
     v = band[S] / band[N]
     square = height * height
-    if square <= s.levels[STEP_SIGMA] ** 2 * v * band[F]:
+    if square * both <= s.levels[STEP_SIGMA] ** 2 * v * band[F]:
         return
     quiet = 2.0 * MAX_FLANK * v * band[F]
-    if d * d > quiet or ring[0, 1] ** 2 > quiet:
+    if d * d * information > quiet or ring[0, 1] ** 2 * ring[0, 2] > quiet:
         return
     if now - s.born[axis] < s.levels[LEARN_TIME]:
         return
@@ -498,7 +561,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
             return
         # Random walk and flicker noise also change the mean over four blocks.
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
-    sigma = np.abs(height) / np.sqrt(v * band[F])
+    sigma = np.abs(height) * np.sqrt(both / (v * band[F]))
     straight = height - 2.0 * (d + ring[0, 1])  # height without the linear drift on both sides
     share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle block pair that follows the step
     if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:

@@ -28,7 +28,7 @@ MIN_SEGMENT, MAX_SEGMENT = 256, 4096
 """Limits of the number of samples in a segment."""
 MIN_SAMPLES: Final = 128
 """Minimum number of samples after an alarm from which a line is identified."""
-MAX_MISSING_SHARE: Final = 0.05
+MAX_MISSING_SHARE: Final = 0.3
 """Maximum share of missing samples in a segment."""
 RATIOS: Final = np.array([4.0, 16.0])[:, None, None]
 """Ratios between the power after and before the onset of a line, for which the evidence is computed."""
@@ -137,7 +137,8 @@ class LineOnsetDetector:
             near = slice(top - SMEAR_BINS, top + SMEAR_BINS + 1)
             # Bins of the line have the same onset. The other bins show the surrounding noise.
             after = np.where(self._count1[ratio, axis] == count, self._sum1[ratio, axis] / count, power[axis])
-            found = self._compare(after, self._before(int(axis)), self._n, MIN_PEAK_RATIO, near)
+            share = float(np.isfinite(self._newest[:, axis]).mean())
+            found = self._compare(after, self._before(int(axis)), self._n, share, MIN_PEAK_RATIO, near)
             if (
                 found
                 and count == MIN_SEGMENTS_AFTER
@@ -164,14 +165,15 @@ class LineOnsetDetector:
         """
         k = min(samples, self._n)
         part = self._newest[-k:, [axis]]
-        if k < max(MIN_SAMPLES, self._n // 16) or not self._count[axis, 0] or not np.isfinite(part).mean() > 0.5:
+        share = float(np.isfinite(part).mean())
+        if k < max(MIN_SAMPLES, self._n // 16) or not self._count[axis, 0] or not share > 0.5:
             return None
         with np.errstate(all="ignore"):
             after, before = _periodogram(part, self._n)[0], self._before(axis)
-            rose = self._compare(after, before, k, MIN_SINGLE_PEAK_RATIO)
+            rose = self._compare(after, before, k, share, MIN_SINGLE_PEAK_RATIO)
             if rose is not None and _lasts(part[-2 * MIN_SAMPLES :, 0], rose[0] / self._rate_hz, rose[2]):
                 return LineChange(axis, *rose, 0, 0.0)
-            fell = self._compare(before, after, k, MIN_SINGLE_PEAK_RATIO)
+            fell = self._compare(before, after, k, share, MIN_SINGLE_PEAK_RATIO)
             return None if fell is None else LineChange(axis, fell[0], fell[2], fell[1], 0, 0.0)
 
     def restart(self, axis: int) -> None:
@@ -205,9 +207,12 @@ class LineOnsetDetector:
         self._count += seen
 
     def _compare(
-        self, high: Floats, low: Floats, samples: int, min_ratio: float, near: slice | None = None
+        self, high: Floats, low: Floats, samples: int, share: float, min_ratio: float, near: slice | None = None
     ) -> tuple[float, float, float] | None:
-        """Return the frequency of a line that is stronger in one periodogram, and its amplitudes in both, or None."""
+        """Return the frequency of a line that is stronger in one periodogram, and its amplitudes in both, or None.
+
+        If only a share of the samples is present, the power of a line relative to the noise is reduced to this share.
+        """
         half = 2 * self._n // samples + 1  # the main lobe of the Hann window has two bins on each side
         side = 4 * half
         first = max(FIRST_BIN, half)
@@ -234,8 +239,8 @@ class LineOnsetDetector:
         frequency = (top + 0.5 * (a - c) / (a - 2.0 * b + c)) * self._rate_hz / self._n
         return (
             float(frequency),
-            float(np.sqrt(2.0 * before)) if before > MIN_POWER_BEFORE * power else 0.0,
-            float(np.sqrt(2.0 * power)),
+            float(np.sqrt(2.0 * before / share)) if before > MIN_POWER_BEFORE * power else 0.0,
+            float(np.sqrt(2.0 * power / share)),
         )
 
 
@@ -245,7 +250,8 @@ def _periodogram(part: Floats, n: int) -> Floats:
     mean = np.where(there, part, 0.0).sum(axis=0) / there.sum(axis=0)
     window = np.hanning(len(part) + 2)[1:-1, None]
     turned = np.fft.rfft(np.where(there, part - mean, 0.0) * window, n, axis=0)[:-1]
-    return np.asarray(2.0 * (turned.real**2 + turned.imag**2).T / (n * (window**2).sum() * there.mean(axis=0)[:, None]))
+    weight = n * (window**2 * there).sum(axis=0)  # white noise has the same power with missing samples
+    return np.asarray(2.0 * (turned.real**2 + turned.imag**2).T / weight[:, None])
 
 
 def _lasts(part: Floats, turns: float, amplitude: float) -> bool:

@@ -44,6 +44,19 @@ def test_line_that_begins_is_named_within_seconds(frequency_hz, amplitude, delay
     assert f"gy line at {change.what['frequency'][0]:.3g} Hz began, amplitude" in change.text
 
 
+@pytest.mark.parametrize("loss", [0.1, 0.2])
+def test_line_is_named_despite_loss(loss):
+    values = simulate_noise(160)
+    values[10_000:] += 2.0 * SIGMA * sinusoid(6_000, 23.4)[:, None]
+    values[np.random.default_rng(1).random(len(values)) < loss] = np.nan
+    changes = find_changes(values)
+    assert sorted(change.axis for change in changes) == list(range(6))
+    for change in changes:
+        assert change.what["frequency"][0] == pytest.approx(23.4, abs=0.15)
+    amplitudes = [change.what["amplitude"][1] for change in changes]
+    assert np.mean(amplitudes) == pytest.approx(2.0 * SIGMA, rel=0.08)
+
+
 def test_line_on_several_axes_that_ends_is_reported_on_each():
     values = simulate_noise(160)
     values[5_000:10_000, 3:] += 3.0 * SIGMA * sinusoid(5_000, 23.4)[:, None]
