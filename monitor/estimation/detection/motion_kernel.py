@@ -13,6 +13,10 @@ must have been learned in motion.
 A step of the noise level is not motion. If the signal has been stationary with zero mean since the beginning of an
 episode, the episode is marked as ``NOISE``, and its blocks become the new reference.
 
+A block of which less than half of the samples are present is neither at rest nor in motion. The blocks before and after
+such blocks are treated as successive blocks, except that the change of the mean between them is not tested. Limits for
+the mean and the variance of a block are computed from the number of its samples that are present.
+
 The index of a sample determines its block, so decisions do not depend on how the samples are distributed over calls.
 """
 
@@ -93,6 +97,8 @@ GROUP_SIGMA: Final = 3.0
 """Maximum deviation of the mean or log variance of a group from the average, in standard deviations of white noise."""
 MIN_GROUP_SCATTER: Final = 0.3
 """Deviation of the log variance of a group that is always accepted, because real noise fluctuates more than χ²."""
+MAX_GAP_BLOCKS: Final = 40
+"""Maximum number of blocks (10 s) without samples within an episode. A longer gap ends the episode."""
 LOOK_EVERY: Final = 20
 """Number of blocks after which the detector tests again whether a disturbance is constant."""
 WANDER: Final = 4.0
@@ -102,7 +108,7 @@ MIN_VARIANCE: Final = 1e-30
 MIN_BLOCK_SAMPLES: Final = 4
 """Minimum number of samples that a block must contain to be tested for motion."""
 
-OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
+OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED, MEASURED, BEGAN_RECENT = range(12)
 """Elements of ``MotionState.place``:
 
 - ``OPEN``: number of the current block.
@@ -111,15 +117,17 @@ OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED =
 - ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the current episode.
 - ``STILL``: number of successive blocks with a constant mean.
 - ``QUIET``: number of successive blocks with a far smaller variance than the reference.
-- ``RECENT``: total number of blocks.
+- ``RECENT``: total number of blocks of which enough samples are present.
 - ``TURNED``: kind of the current episode, ``MOTION`` or ``TURN``.
+- ``MEASURED``: number of the newest block of which enough samples are present.
+- ``BEGAN_RECENT``: value of ``RECENT`` after the first moving block of the current episode.
 """
 FIRST, LAST, KIND, AXIS, PEAK = range(5)
 """Columns of an episode: first and last moving block, kind, axis of the peak, size of the peak."""
 MOTION, TURN, NOISE = range(3)
 """Kinds of episodes: motion, motion that changed the orientation, step of the noise level."""
-LOG_VARIANCE, MEAN = 0, 1
-"""Indices of the block statistics in the first dimension of the ring buffers."""
+LOG_VARIANCE, MEAN, PRESENT = range(3)
+"""Indices of the block statistics in the first dimension of the ring buffers: ``PRESENT`` is a number of samples."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 """Columns of ``MotionState.open``:
 
@@ -135,24 +143,24 @@ COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 class MotionState(NamedTuple):
     """State of the motion detector."""
 
-    place: Ints  # [10] counters and flags, at the indices from OPEN to TURNED
+    place: Ints  # [12] counters and flags, at the indices from OPEN to BEGAN_RECENT
     open: Floats  # [6, 8] current block, with the columns from COUNT to STEP
     seen: Ints  # [6] total number of blocks that were added to the reference
     shifted: Floats  # [6] sum of the shifts of the mean caused by new orientations
     ring: Floats  # [2, 6, REFERENCE_BLOCKS] ring buffer of the log variance and the mean of blocks at rest
     ordered: Floats  # [2, 6, REFERENCE_BLOCKS] sorted values of ``ring``
-    recent: Floats  # [2, 6, REFERENCE_BLOCKS] ring buffer of the log variance and the mean of all recent blocks
+    recent: Floats  # [3, 6, REFERENCE_BLOCKS] ring buffer of the statistics of all recent blocks
     peaks: Floats  # [2, 6] largest deviation in the current episode, in SI units and relative to the noise
 
 
 def make_motion_state() -> MotionState:
     """Return the initial state of the motion detector."""
-    place = np.zeros(10, np.int64)
-    place[[HELD, BEGAN]] = -1
+    place = np.zeros(12, np.int64)
+    place[[HELD, BEGAN, MEASURED]] = -1
     place[QUIET_RUN] = EPISODE_GAP_BLOCKS
     fresh = np.zeros((AXES, 8))
     fresh[:, BEFORE] = np.nan
-    rings = [np.full((2, AXES, REFERENCE_BLOCKS), np.nan) for _ in range(3)]
+    rings = [np.full((kinds, AXES, REFERENCE_BLOCKS), np.nan) for kinds in (2, 2, 3)]
     return MotionState(
         place, fresh, np.zeros(AXES, np.int64), np.zeros(AXES), rings[0], rings[1], rings[2], np.zeros((2, AXES))
     )
@@ -228,32 +236,44 @@ def advance_motion_detection(
 @compiled
 def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
     number = s.place[OPEN]
-    follows = s.place[HELD] == number - 1
-    now = np.empty((2, AXES))
+    now, measured = np.empty((3, AXES)), False
     for a in range(AXES):
         now[LOG_VARIANCE, a] = now[MEAN, a] = nan
+        now[PRESENT, a] = s.open[a, COUNT]
         if 2.0 * s.open[a, COUNT] >= size and s.open[a, COUNT] >= MIN_BLOCK_SAMPLES:
             _measure(a, s, now)
-    moves = _judge(now, follows, size, s)
+            measured = True
+    if measured:
+        _decide(now, number, size, s, episodes, filled)
+    _emit(s, blocks, moving, filled)
+    s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= REMOVED_AFTER
+    for a in range(AXES):
+        s.open[a, COUNT] = 0.0
+
+
+@compiled
+def _decide(now: Floats, number: int, size: int, s: MotionState, episodes: Floats, filled: Ints) -> None:
+    """Decide on a block, and end the current episode if the sensor is at rest again."""
+    if s.place[BEGAN] >= 0 and number - s.place[MEASURED] > MAX_GAP_BLOCKS:
+        _end(s, episodes, filled)
+        s.place[QUIET_RUN] = EPISODE_GAP_BLOCKS
+    moves = _judge(now, s.place[MEASURED] == number - 1, s)
+    s.place[MEASURED] = number
     if moves:
         _remember(now, number, s)
-        s.place[HELD_MOVES] |= follows
-    _learn(now, moves, number, size, s)
-    lasted = number - s.place[BEGAN]  # without the first block, which contains the onset
-    if s.place[BEGAN] >= 0 and MIN_NOISE_BLOCKS <= lasted <= MAX_NOISE_BLOCKS and _stationary(lasted, size, s):
+        s.place[HELD_MOVES] |= s.place[HELD] == number - 1
+    _learn(now, moves, size, s)
+    lasted = s.place[RECENT] - s.place[BEGAN_RECENT]  # without the first block, which contains the onset
+    if s.place[BEGAN] >= 0 and MIN_NOISE_BLOCKS <= lasted <= MAX_NOISE_BLOCKS and _stationary(lasted, s):
         _begin_anew(lasted, s)
         s.place[TURNED] = NOISE
         _end(s, episodes, filled)
-    _emit(s, blocks, moving, filled)
     s.place[QUIET_RUN] = 0 if moves else min(s.place[QUIET_RUN] + 1, EPISODE_GAP_BLOCKS)
-    s.place[HELD], s.place[HELD_MOVES] = number, s.place[QUIET_RUN] <= REMOVED_AFTER
     if s.place[BEGAN] >= 0 and s.place[QUIET_RUN] == EPISODE_GAP_BLOCKS:
         if s.place[TURNED] == MOTION and lasted <= MAX_NOISE_BLOCKS and _still_loud(size, s):
             s.place[QUIET_RUN] -= 1
         else:
             _end(s, episodes, filled)
-    for a in range(AXES):
-        s.open[a, COUNT] = 0.0
 
 
 @compiled
@@ -282,7 +302,7 @@ def _measure(a: int, s: MotionState, now: Floats) -> None:
 
 
 @compiled
-def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
+def _judge(now: Floats, follows: bool, s: MotionState) -> bool:
     """Return True if a block is in motion. If the orientation has changed, the reference is shifted."""
     loud, off, rotates = False, False, False
     still = follows
@@ -300,12 +320,12 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
         step = s.open[a, STEP]
         middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
         # The standard deviation of ln(χ²/ν) is approximately √(2/ν).
-        sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
+        sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (now[PRESENT, a] - 2.0))), LOUDEST / BAND)
         loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
         rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, MIN_VARIANCE)) - middle
         rise = min(max(rise, -LOUDEST), LOUDEST)
         judged, rises, excess = judged + 1, rises + rise / young, excess + rise / sigma / young
-        band = young * _band(a, n, size, s) + step
+        band = young * _band(a, n, now[PRESENT, a], s) + step
         far = now[MEAN, a] - _quantile(s.ordered[MEAN, a], n, 0.5)
         off |= abs(far) > band
         rotates |= a < GYROS and abs(far + s.shifted[a]) > max(band, NEW_BIAS)
@@ -322,9 +342,9 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
 
 
 @compiled
-def _band(a: int, n: int, size: int, s: MotionState) -> float:
+def _band(a: int, n: int, present: float, s: MotionState) -> float:
     """Return the maximum deviation of a block mean at rest from the median of the reference."""
-    explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
+    explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(present)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
@@ -346,12 +366,13 @@ def _take_over(now: Floats, s: MotionState) -> None:
 
 
 @compiled
-def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> None:
+def _learn(now: Floats, moves: bool, size: int, s: MotionState) -> None:
     newest = s.place[RECENT] % REFERENCE_BLOCKS
     s.place[RECENT] += 1
     quieter = measured = 0
     for a in range(AXES):
-        s.recent[LOG_VARIANCE, a, newest], s.recent[MEAN, a, newest] = now[LOG_VARIANCE, a], now[MEAN, a]
+        for kind in range(3):
+            s.recent[kind, a, newest] = now[kind, a]
         n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] != now[MEAN, a]:
             continue
@@ -367,7 +388,7 @@ def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> 
     if s.place[QUIET] == MIN_REFERENCE_BLOCKS:
         blocks = MIN_REFERENCE_BLOCKS
         s.place[QUIET] = 0
-    lasted = number - s.place[BEGAN] + 1
+    lasted = s.place[RECENT] - s.place[BEGAN_RECENT] + 1
     if moves and lasted >= REFERENCE_BLOCKS and lasted % LOOK_EVERY == 0 and _steady(size, s):
         blocks = REFERENCE_BLOCKS
     if blocks > 0:
@@ -455,38 +476,38 @@ def _steady(size: int, s: MotionState) -> bool:
 
 
 @compiled
-def _stationary(blocks: int, size: int, s: MotionState) -> bool:
+def _stationary(blocks: int, s: MotionState) -> bool:
     """Return True if the most recent blocks have a constant variance and the mean of the reference on all axes."""
     groups = blocks // GROUP_BLOCKS
-    means, variances = np.empty(groups), np.empty(groups)
+    means, variances, present = np.empty((3, groups))
     for a in range(AXES):
         if s.seen[a] < MIN_REFERENCE_BLOCKS:
             return False
         for g in range(groups):
-            n, total, squares, within = 0, 0.0, 0.0, 0.0
+            n, samples, total, squares, within = 0, 0.0, 0.0, 0.0, 0.0
             for back in range(g * GROUP_BLOCKS + 1, (g + 1) * GROUP_BLOCKS + 1):
                 k = (s.place[RECENT] - back) % REFERENCE_BLOCKS
                 mean = s.recent[MEAN, a, k] - s.ordered[MEAN, a, 0]
                 if mean == mean:
                     n += 1
-                    total += mean
-                    squares += mean * mean
-                    within += exp(s.recent[LOG_VARIANCE, a, k])
+                    samples += s.recent[PRESENT, a, k]
+                    total += s.recent[PRESENT, a, k] * mean
+                    squares += s.recent[PRESENT, a, k] * mean * mean
+                    within += s.recent[PRESENT, a, k] * exp(s.recent[LOG_VARIANCE, a, k])
             if n < GROUP_BLOCKS - 1:
                 return False
-            means[g] = total / n
-            variances[g] = (within + max(squares - n * means[g] ** 2, 0.0)) / n
-        white = np.mean(variances) / (GROUP_BLOCKS * size)
+            means[g], present[g] = total / samples, samples
+            variances[g] = (within + max(squares - samples * means[g] ** 2, 0.0)) / samples
         n = min(s.seen[a], REFERENCE_BLOCKS)
-        usual = max(_scatter(s.ordered[MEAN, a], n), sqrt(white))
-        band = GROUP_SIGMA * usual + s.open[a, STEP]
+        learned = _scatter(s.ordered[MEAN, a], n)
         rest = _quantile(s.ordered[MEAN, a], n, 0.5) - s.ordered[MEAN, a, 0]
-        scatter = max(GROUP_SIGMA * sqrt(2.0 / (GROUP_BLOCKS * size)), MIN_GROUP_SCATTER)
         level = log(np.mean(variances))
         rise = level - _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
         if level > 2.0 * log(NEVER_AT_REST[a]) or (rise > LARGE_RISE and blocks < 2 * MIN_NOISE_BLOCKS):
             return False
         for g in range(groups):
+            band = GROUP_SIGMA * max(learned, sqrt(np.mean(variances) / present[g])) + s.open[a, STEP]
+            scatter = max(GROUP_SIGMA * sqrt(2.0 / present[g]), MIN_GROUP_SCATTER)
             if abs(means[g] - rest) > band or abs(log(variances[g]) - level) > scatter:
                 return False
     return True
@@ -556,7 +577,7 @@ def _scatter(ordered: Floats, n: int) -> float:
 @compiled
 def _remember(now: Floats, number: int, s: MotionState) -> None:
     if s.place[BEGAN] < 0:
-        s.place[BEGAN], s.place[TURNED] = number, 0
+        s.place[BEGAN], s.place[TURNED], s.place[BEGAN_RECENT] = number, 0, s.place[RECENT] + 1
         for a in range(AXES):
             s.peaks[0, a] = s.peaks[1, a] = 0.0
     s.place[LATEST] = number

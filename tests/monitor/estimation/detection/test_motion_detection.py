@@ -106,6 +106,53 @@ def test_missing_samples_keep_their_positions():
     assert (found.kind, found.since, found.until) == (motion.kind, motion.since, motion.until)
 
 
+def detect_in_stream(values):
+    """Return the episodes if the missing rows are not received."""
+    detector, previous = MotionDetector(RATE), -1
+    present = np.flatnonzero(np.isfinite(values[:, 0]))
+    for rows in np.split(present, np.flatnonzero(np.diff(present) > 1) + 1):
+        lost = int(rows[0]) - previous - 1
+        detector.advance_and_take_decided(make_block(rows, values[rows], lost=lost))
+        previous = int(rows[-1])
+    detector.flush_delayed_samples()
+    return detector.take_motions()
+
+
+@pytest.mark.parametrize("lost", [100, 300])
+def test_burst_of_loss_within_a_motion_is_not_rest(lost):
+    values = add_hand_rotation(simulate_rest(60), 30.0, 45.0)
+    values[3600 : 3600 + lost] = np.nan
+    _, motions = detect_motion(values, RATE)
+    assert [motion.kind for motion in motions] == ["motion"]
+    assert motions[0].seconds == pytest.approx(15.0, abs=1.0)
+    assert detect_in_stream(values) == motions
+
+
+def test_motions_before_and_after_a_long_gap_are_two():
+    values = add_hand_rotation(add_hand_rotation(simulate_rest(100), 27.0, 30.1), 60.0, 63.0)
+    values[3000:6000] = np.nan
+    _, motions = detect_motion(values, RATE)
+    assert [motion.seconds < 4.0 for motion in motions] == [True, True]
+    assert detect_in_stream(values) == motions
+
+
+@pytest.mark.parametrize("loss", ["random", "burst"])
+def test_step_of_the_noise_is_not_motion_despite_loss(loss):
+    called_motion = 0
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        values = 1e-3 * rng.standard_normal((9000, 6))
+        values[4000:] *= 4.0
+        if loss == "random":
+            values[rng.random(9000) < 0.2] = np.nan
+        else:
+            begin = 4000 + int(rng.integers(50, 500))
+            values[begin : begin + 300] = np.nan
+        called_motion += any(motion.kind != "noise" for motion in detect_in_stream(values))
+        called_motion += bool(detect_motion(values, RATE)[1])
+    assert called_motion <= 2
+
+
 def test_very_long_gap_takes_no_time():
     detector = MotionDetector(RATE)
     detector.advance_and_take_decided(make_block(np.arange(2000), simulate_rest(20)))
