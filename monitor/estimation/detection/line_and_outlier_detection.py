@@ -43,8 +43,13 @@ MAX_OUTLIER_STRETCHES: Final = 32
 
 With these 131 072 samples, an outlier share of 0.001 is measured with a relative error of 10 %.
 """
-MAX_MISSING_SHARE: Final = 0.05
+MAX_MISSING_SHARE: Final = 0.3
 """Maximum share of missing samples in a segment."""
+MAX_LEAKAGE: Final = 0.05
+"""Minimum power of a peak, relative to the power of the strongest line that missing samples spread over the spectrum.
+
+Bursts of loss of equal length spread the power unevenly, which resembles resonances beside the line.
+"""
 MIN_PEAK_SIGMA: Final = 6.5
 """Minimum height of a spectral peak in standard deviations.
 
@@ -125,12 +130,19 @@ def detect_spectral_lines_per_axis(
         return []
     found = []
     for axis in range(len(AXES)):
-        parts = [_filled(part) for part in _stretches(values[:, axis], in_motion, rows, MAX_STRETCHES)]
-        if len(parts) < MIN_STRETCHES:
+        stretches = list(_stretches(values[:, axis], in_motion, rows, MAX_STRETCHES))
+        if len(stretches) < MIN_STRETCHES:
             continue
+        parts = np.stack(stretches)
+        present = float(np.isfinite(parts).mean())  # missing samples reduce a line relative to the noise
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # for constant axes and extreme values
-            peaks = _peaks(_spectrum(np.stack(parts)), len(parts))
-            of_axis = [_make_line(axis, peak, rate_hz / rows, rate_hz, curve) for peak in peaks]
+            peaks = _peaks(_spectrum(parts), len(parts))
+            leakage = MAX_LEAKAGE * (1.0 - present) * max((peak.power for peak in peaks), default=0.0)
+            of_axis = [
+                _make_line(axis, peak, present, rate_hz / rows, rate_hz, curve)
+                for peak in peaks
+                if peak.power >= leakage
+            ]
         strong = sorted((one for one in of_axis if one.share >= MIN_LINE_SHARE), key=lambda one: -one.share)
         found += strong[:MAX_LINES]
     return found
@@ -191,20 +203,16 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
             yield part
 
 
-def _filled(part: Floats) -> Floats:
-    """Subtract the mean of a segment, and replace missing samples by 0."""
-    there = np.isfinite(part)
-    return np.where(there, part - part[there].mean(), 0.0)
-
-
 def _spectrum(parts: Floats) -> Floats:
-    """Return the mean square per bin [rows / 2] of zero-mean segments [k, rows]."""
+    """Return the mean square per bin [rows / 2] of segments [k, rows]. Missing samples do not change white noise."""
+    present = np.isfinite(parts)
     window = np.hanning(parts.shape[1])
-    turned = np.fft.rfft(parts * window, axis=1)[
+    mean = np.where(present, parts, 0.0).sum(axis=1, keepdims=True) / present.sum(axis=1, keepdims=True)
+    turned = np.fft.rfft(np.where(present, parts - mean, 0.0) * window, axis=1)[
         :, :-1
     ]  # The bin at half the sample rate is left out, because it has only one degree of freedom.
-    power = (turned.real**2 + turned.imag**2).mean(axis=0)
-    return np.asarray(2.0 * power / (parts.shape[1] * (window**2).sum()))
+    weight = parts.shape[1] * (present @ window**2)
+    return np.asarray(2.0 * ((turned.real**2 + turned.imag**2) / weight[:, None]).mean(axis=0))
 
 
 def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
@@ -261,8 +269,10 @@ def _find_runs(marks: Mask) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> SpectralLine:
-    frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
+def _make_line(
+    axis: int, peak: _Peak, present: float, bin_hz: float, rate_hz: float, curve: AllanCurve
+) -> SpectralLine:
+    frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power / present) ** 0.5
     shares = _allan_share(axis, frequency / rate_hz, amplitude, curve)
     return SpectralLine(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
 

@@ -131,9 +131,10 @@ def test_resonance_is_wide_and_has_its_power(hz, q):
     assert line.amplitude == pytest.approx(2e-3 * 2**0.5, rel=0.12)
 
 
-def test_missing_and_moving_samples_do_not_hide_a_line():
+@pytest.mark.parametrize("loss", [0.02, 0.2])
+def test_missing_and_moving_samples_do_not_hide_a_line(loss):
     values = simulate_line(60_000, 2e-3, 17.3)
-    values[np.random.default_rng(1).random(60_000) < 0.02] = np.nan
+    values[np.random.default_rng(1).random(60_000) < loss] = np.nan
     values[20_000:23_000] = np.nan
     moving = np.zeros(60_000, bool)
     moving[40_000:42_000] = True
@@ -143,6 +144,13 @@ def test_missing_and_moving_samples_do_not_hide_a_line():
     assert line.frequency_hz == pytest.approx(17.3, abs=0.03)
     assert line.amplitude == pytest.approx(2e-3, rel=0.05)
     assert find_outlier_shares(values, moving).max() < 1e-4
+
+
+def test_bursts_of_loss_do_not_surround_a_strong_line_with_resonances():
+    values = simulate_line(120_000, 1e-2, 17.3)
+    for begin in np.random.default_rng(3).integers(0, 119_900, 120):
+        values[begin : begin + 100] = np.nan
+    assert [round(line.frequency_hz, 1) for line in find_lines(values)] == [17.3]
 
 
 def test_too_many_missing_samples_give_no_result():
