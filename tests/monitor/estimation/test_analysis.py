@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError, NotReady
+from drivers.recordings import iter_blocks, load_samples
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_disturbances
+from monitor.estimation.detection.motion_detection import detect_motion
 from monitor.estimation.fit.coefficients_with_intervals import Status
 from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, place_samples_on_grid
 from tests.support.recordings import recorded_blocks, recordings, white
@@ -53,6 +55,53 @@ def test_note_says_which_share_is_missing_and_what_it_costs(lost, expected):
     kept[lost] = False
     found = analyze(recorded_blocks(np.flatnonzero(kept) / 100, white(12_000)[kept]), 100.0)
     assert any(re.fullmatch(expected, note) for note in found.notes), found.notes
+
+
+def assert_same_coefficients(found, expected, axes=slice(None)):
+    for name in ("status", "value", "lo", "hi"):
+        values = (getattr(one.estimate.coefficients, name)[:, axes] for one in (found, expected))
+        assert np.array_equal(*values, equal_nan=True), name
+
+
+def simulate_loss(n):
+    rng = np.random.default_rng(3)
+    lost = rng.random(n) < 0.03
+    lost[n // 2 : n // 2 + 150] = True
+    lost[[0, -1]] = False
+    return lost
+
+
+@pytest.mark.parametrize("kind", ["nan", "###", "inf", "1e200", ""])
+def test_corrupt_rows_give_the_coefficients_of_a_recording_without_them(tmp_path, kind):
+    values, lost = white(12_000), simulate_loss(12_000)
+    head = "t,gx,gy,gz,ax,ay,az"
+    rows = [f"{i / 100:.2f},{','.join(repr(x) for x in row)}" for i, row in enumerate(values.tolist())]
+    kept = [row for row, is_lost in zip(rows, lost, strict=True) if not is_lost]
+    rows = [f"{i / 100:.2f}{f',{kind}' * 6}" if lost[i] else row for i, row in enumerate(rows)]
+    found = []
+    for name, lines in (("corrupt.csv", rows), ("deleted.csv", kept)):
+        path = tmp_path / name
+        path.write_text("\n".join([head, *lines]))
+        found.append(analyze(list(iter_blocks(load_samples(path))), 100.0))
+    assert_same_coefficients(*found)
+
+
+def test_missing_samples_of_one_axis_are_missing_samples_of_this_axis_only():
+    values, lost = white(12_000), simulate_loss(12_000)
+    t, partly = np.arange(12_000) / 100, values.copy()
+    partly[lost, 2] = np.nan
+    found = analyze(recorded_blocks(t, partly), 100.0)
+    assert_same_coefficients(found, analyze(recorded_blocks(t[~lost], values[~lost]), 100.0), 2)
+    assert_same_coefficients(found, analyze(recorded_blocks(t, values), 100.0), [0, 1, 3, 4, 5])
+
+
+def test_excluded_motion_gives_the_coefficients_of_a_recording_without_these_rows():
+    values, t = white(12_000), np.arange(12_000) / 100
+    values[5000:5400, 0] += 0.05 * np.sin(np.arange(400) / 20)
+    moving, _ = detect_motion(values, 100.0)
+    assert 400 <= moving.sum() < 600
+    found = analyze(recorded_blocks(t, values), 100.0, remove_motion=True)
+    assert_same_coefficients(found, analyze(recorded_blocks(t[~moving], values[~moving]), 100.0))
 
 
 def test_very_long_gap_is_not_counted_among_the_short_gaps():
@@ -129,8 +178,6 @@ def test_absent_axis_is_unestimated_without_a_note():
     ],
 )
 def test_real_recordings_have_the_known_rate(name, rate):
-    from drivers.recordings import iter_blocks, load_samples
-
     loaded = load_samples(recordings() / name)
     blocks = list(iter_blocks(loaded))
     found = analyze(blocks, None, reading_notes=loaded.notes)

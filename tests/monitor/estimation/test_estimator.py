@@ -49,6 +49,21 @@ def test_missing_samples_keep_their_positions():
     assert found.n == 937
 
 
+@pytest.mark.parametrize("every_sample", [False, True])
+def test_rows_of_nan_equal_lost_samples(every_sample):
+    whole = make_samples(0, 3000)
+    masked = whole.values.copy()
+    masked[[700, *range(1500, 1550)]] = np.nan
+    lossy, rows_of_nan = (Estimator(RATE, 20.0, every_sample=every_sample) for _ in range(2))
+    for first, end, lost in ((0, 700, 0), (701, 1500, 1), (1550, 3000, 50)):
+        lossy.add_samples(make_block(whole.t_ns[first:end], whole.values[first:end], lost=lost))
+    rows_of_nan.add_samples(make_block(whole.t_ns, masked))
+    found, expected = lossy.get_estimate(), rows_of_nan.get_estimate()
+    assert np.array_equal(found.curve.avar, expected.curve.avar)
+    assert np.array_equal(found.coefficients.hi, expected.coefficients.hi, equal_nan=True)
+    assert lossy.loss_of_samples() == rows_of_nan.loss_of_samples()
+
+
 @pytest.mark.parametrize("lost", [1999, 2000, 2001, 10**11])
 def test_gap_of_about_the_window_length_leaves_only_new_samples(lost):
     """A longer gap empties the window. After a shorter gap, clusters at its end are partly filled with new samples."""
