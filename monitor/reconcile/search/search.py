@@ -312,7 +312,11 @@ def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) 
     if isinstance(trial.effect, WanderingVariance):  # the mean variance of the recording depends on chance
         model = with_fitted_mean_variance(axis, (*model, trial.effect))[: len(model)]
     added = refit_correlation_times(axis, added, model)
-    return drop_unneeded_effects(fit_with_fewest_changes(axis, added, model))
+    found = drop_unneeded_effects(fit_with_fewest_changes(axis, added, model))
+    if np.isfinite(axis.raw).all():
+        return found
+    axis = repair_axis_again(axis, found.effects, rng)  # the missing samples depend on the spectrum
+    return drop_unneeded_effects(fit_with_fewest_changes(axis, found.added, found.model))
 
 
 def _is_gaussian_and_stationary(whitened: WhitenedAxis, null: AxisNull) -> bool:
