@@ -36,9 +36,16 @@ LABELS: Final = {
     "temperature": re.compile(r"temp|temperature|tmp"),
     "t": re.compile(r"time|ts|timestamp|ms|us|millis|micros|ticks?"),
     "counter": re.compile(r"cnt|count|counter|seq|sequence|n|idx|index|frame"),
-    SKIP: re.compile(r"m|mag|magn|magnetometer|q|quat|euler|rpy|roll|pitch|yaw|baro|pressure|p|hum|humidity|alt"),
+    "angle": re.compile(r"roll|pitch|yaw|heading|angle[_.]?[xyz]"),
+    "angles": re.compile(r"euler|rpy|ypr|angles?"),
+    "magnetic field": re.compile(r"m|mag|magn|magnetometer|m(?:ag)?[_.]?[xyz]"),
+    "quaternion": re.compile(r"q|quat|quaternion|q[_.]?[wxyz]"),
+    "environment": re.compile(r"baro|pressure|p|hum|humidity|alt|altitude"),
 }
-"""Labels of each column in lower case. ``a`` and ``g`` stand for three axes."""
+"""Labels of each quantity in lower case. ``a`` and ``g`` stand for three axes."""
+GROUP_SIZES: Final = {"a": 3, "g": 3, "angles": 3, "magnetic field": 3, "quaternion": 4}
+"""Number of values after one label, where it is not 1."""
+NOT_USED: Final = frozenset(["angle", "angles", "magnetic field", "quaternion", "environment"])
 AXIS_LABEL: Final = re.compile(
     r"(?P<kind>ac?c?|accel|g|gyr?|gyro|w|omega)[_.]?(?P<axis>[xyz])|(?P<first>[xyz])[_.]?(?P<last>a|acc|accel|g|gyro?)"
 )
@@ -129,9 +136,10 @@ def _name_columns(labels: Sequence[str], table: Floats) -> list[str]:
     increases = np.all(steps > 0.0, axis=0)
     columns: list[str] = []
     kind, used = SKIP, 3  # the last label of a kind, and how many numbers belong to it
-    for label, increasing in zip(labels, increases.tolist(), strict=True):
+    first = labels[0].rstrip(" ,;|\t")  # a separator after the label of the line, as in ``ypr,1,2,3``
+    for label, increasing in zip((first, *labels[1:]), increases.tolist(), strict=True):
         name = SKIP
-        for word in _list_label_words(label, within_group=0 < used < 3):
+        for word in _list_label_words(label, within_group=kind in ("a", "g") and 0 < used < 3):
             named = AXIS_LABEL.fullmatch(word)
             found = [one for one, words in LABELS.items() if words.fullmatch(word)]
             if named:
@@ -140,13 +148,14 @@ def _name_columns(labels: Sequence[str], table: Floats) -> list[str]:
                 name, used = kind + word, 3
             elif word == "t" or found:
                 kind, used = found[0] if found else "t" if increasing else "temperature", 0
-        if name == SKIP and kind != SKIP and used < (3 if kind in ("a", "g") else 1):
+        if name == SKIP and kind != SKIP and used < GROUP_SIZES.get(kind, 1):
             name = kind + "xyz"[used] if kind in ("a", "g") else kind
             used += 1
         columns.append(name)
-    columns = [SKIP if name in columns[:i] else name for i, name in enumerate(columns)]
+    columns = [SKIP if name in columns[:i] and name not in NOT_USED else name for i, name in enumerate(columns)]
     if not set(columns) & set(AXES):
         columns = _assign_axes_by_size(columns, table)
+    columns = [SKIP if name in NOT_USED else name for name in columns]
     is_clock = {"t": increases, "counter": np.all(steps == 1.0, axis=0) & ("t" not in columns)}
     return [SKIP if name in is_clock and not is_clock[name][i] else name for i, name in enumerate(columns)]
 
@@ -156,7 +165,7 @@ def _list_label_words(text: str, within_group: bool) -> list[str]:
 
     Between the three axes of a group, as in ``A 0.1g 0.2g 0.3g``, a word without ``:`` or ``=`` is a unit.
     """
-    words = re.findall(r"[a-z_.]+", re.split(r"[,;|\t]", text)[-1].lower())
+    words = re.findall(r"[a-z_.]+", re.sub(r"\bm/s\S*", "", re.split(r"[,;|\t]", text)[-1].lower()))
     return words if not within_group or re.search("[:=]", text) else [one for one in words if AXIS_LABEL.fullmatch(one)]
 
 

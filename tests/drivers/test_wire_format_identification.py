@@ -140,12 +140,28 @@ def test_identified_text_lines_are_decoded_with_the_right_axes(
         ("{0:.3f}; {1:.3f}; {2:.3f}", 9.81, "ax ay az"),
         ("{3:.3f},{4:.3f},{5:.3f}", 9.81, "gx gy gz"),
         ("gx:{3:.3f},gy:{4:.3f},az:{2:.3f},light:3", 9.81, "gx gy az -"),
+        ("roll:{3:.3f},pitch:{4:.3f},yaw:{5:.3f},{0:.3f},{1:.3f},{2:.3f}", 9.81, "- - - ax ay az"),
+        ("rpy:{3:.3f},{4:.3f},{5:.3f},{0:.3f},{1:.3f},{2:.3f}", 9.81, "- - - ax ay az"),
     ],
 )
 def test_columns_of_numbers_are_named_by_labels_or_gravity(layout: str, gravity: float, columns: str) -> None:
     found = identify_wire_format(write_text_lines(layout, gravity)[0])
     assert found is not None
     assert (found.decoder, found.options["columns"]) == (TEXT_DECODER, columns.split())
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        "roll {3:.3f} pitch {4:.3f} yaw {5:.3f}",
+        "ypr\t{3:.3f}\t{4:.3f}\t{5:.3f}",
+        "mag: {3:.3f}, {4:.3f}, {5:.3f}",
+        "mx={3:.3f} my={4:.3f} mz={5:.3f}",
+        "q:{2:.3f},{3:.3f},{4:.3f},{5:.3f}",
+    ],
+)
+def test_other_labelled_quantities_are_not_axes(layout: str) -> None:
+    assert identify_wire_format(write_text_lines(layout, 1.0)[0]) is None
 
 
 def test_text_at_a_wrong_baud_rate_is_not_readable() -> None:
