@@ -387,12 +387,14 @@ def _look(
         cum[axis, j, i] += unit[axis, j, i]
         unit[axis, j, i] = 0.0
     unsettled = band[axis, j, N] < SETTLED
+    # a tick in which the seeds end has only a few other differences
+    seeds_end = band[axis, j, N] == SEED and k < TICK_SAMPLES >> (j + 1)
     band[axis, j, N] += k
     band[axis, j, S] += q
     if unsettled and band[axis, j, N] >= SETTLED:
         band[axis, j, LIMIT] = CLIP * band[axis, j, S] / band[axis, j, N]
     best = _raise_cusums(cusum, band, axis, j, k, q, now, h)
-    if best < 0 and alarm[axis, KIND] == 0.0:
+    if best < 0 and alarm[axis, KIND] == 0.0 and not seeds_end:
         _feed_spread(spread, band, axis, j, q, k)
     return best
 

@@ -55,10 +55,10 @@ MAX_DEVIANCE_NATS_PER_BIN: Final = 1.0
 
 The expectation for the true model is 0.5 nats, and 0.64 nats in a bin with a single coefficient.
 """
-MIN_POWER_RATIO: Final = 1e-9
+MIN_POWER_RATIO: Final = 1e-6
 """Smallest power of a frequency bin relative to the mean, which limits the condition of the equations."""
-MAX_SOLVER_ITERATIONS: Final = 1000
-SOLVER_TOLERANCE: Final = 1e-4
+MAX_SOLVER_ITERATIONS: Final = 300
+SOLVER_TOLERANCE: Final = 1e-3
 """Largest residual of the equations, in units of its standard deviation for a random draw."""
 CLIP_LEVEL_SAMPLES: Final = 64
 """Number of samples on each side that determine the mean level of clipped samples."""

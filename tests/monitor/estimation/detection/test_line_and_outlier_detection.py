@@ -94,13 +94,9 @@ def test_line_with_a_negligible_share_is_not_reported():
     assert line.share > MIN_LINE_SHARE
     assert find_lines(weak) == []
     # The line is clear enough to be found and is left out only because of its share.
-    parts = [
-        line_and_outlier_detection._filled(part)
-        for part in line_and_outlier_detection._stretches(strong[:, 1], np.zeros(600_000, bool), ROWS, 128)
-    ]
-    assert (
-        len(line_and_outlier_detection._peaks(line_and_outlier_detection._spectrum(np.stack(parts)), len(parts))) == 1
-    )
+    parts = [*line_and_outlier_detection._stretches(strong[:, 1], np.zeros(600_000, bool), ROWS, 128)]
+    peaks = line_and_outlier_detection._peaks(line_and_outlier_detection._spectrum(np.stack(parts)), len(parts))
+    assert len(peaks) == 1
     curve = compute_curve(strong)
     curve.avar[:] *= 2.0 * line.share / MIN_LINE_SHARE
     assert detect_spectral_lines_per_axis(strong, np.zeros(600_000, bool), RATE_HZ, curve) == []
