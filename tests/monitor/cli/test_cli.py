@@ -1412,7 +1412,7 @@ def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
         addresses = wait_for_bound_addresses(psutil.Process(daemon.process.pid), least)
         assert len(addresses) >= least, addresses
         assert {address for address, _ in addresses} <= {"127.0.0.1", "::1"}
-        assert daemon.signal_and_wait(signal.SIGTERM) == 0
+        assert daemon.signal_and_wait(signal.SIGTERM) == 0, daemon.read_remaining_errors()
 
 
 @pytest.mark.long
