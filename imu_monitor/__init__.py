@@ -13,12 +13,14 @@ contains only data, and is located by its path next to ``monitor``.
 The commands ``imu-monitor`` and ``python -m imu_monitor`` call ``main``.
 """
 
+import atexit
 import contextlib
 import gc
 import importlib
 import io
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
@@ -142,7 +144,7 @@ def open_standard_streams() -> None:
 
 
 def main() -> None:
-    """Run the program, and end with ``SystemExit``."""
+    """Run the program and end the process, or raise ``SystemExit``."""
     open_standard_streams()
     gc.set_threshold(GARBAGE_THRESHOLD)
     debug = DEBUG in sys.argv[1:]
@@ -155,7 +157,22 @@ def main() -> None:
         if debug:
             raise
         _fail(f"cannot be started: {' '.join(str(error).split())}")
-    run()
+    try:
+        run()
+    except SystemExit as end:
+        others = [one for one in threading.enumerate() if one is not threading.main_thread()]
+        if others and isinstance(end.code, int) and all(one.daemon for one in others):
+            _exit_beside_threads(end.code)
+        raise
+
+
+def _exit_beside_threads(status: int) -> NoReturn:
+    """End the process without the interpreter's own end, which aborts the process if a thread computes a transform."""
+    atexit._run_exitfuncs()  # noqa: SLF001 - there is no public name
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
 
 
 def _is_own(module: ModuleType, name: str) -> bool:

@@ -1290,6 +1290,34 @@ def test_signal_stops_the_daemon_cleanly(tmp_path: Path, command: str, number: i
     assert not Path(port).exists()  # the simulated port has been removed
 
 
+def test_thread_that_computes_does_not_abort_the_program_at_its_end() -> None:
+    """A thread that is in a transform when the interpreter ends would abort the process with SIGABRT."""
+    source = """
+import atexit, threading
+import numpy as np
+import scipy.fft
+import imu_monitor
+import monitor.cli
+started = threading.Event()
+values = np.ones(1 << 21)
+def transform():
+    while True:
+        scipy.fft.dct(values)
+        started.set()
+def command(**_):
+    atexit.register(print, "orderly")
+    threading.Thread(target=transform, daemon=True).start()
+    started.wait()
+    return 3
+monitor.cli.app = command
+imu_monitor.main()
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", source], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert (run.returncode, run.stdout, run.stderr) == (3, "orderly\n", "")
+
+
 @pytest.mark.long
 def test_second_interrupt_ends_the_daemon_at_once() -> None:
     source = """
