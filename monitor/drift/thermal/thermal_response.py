@@ -148,21 +148,6 @@ def apply_first_order_lag(values: Floats, root: float) -> Floats:
     return out
 
 
-def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
-    """Return the least-squares coefficients [terms]. The regressors are scaled internally for numerical stability.
-
-    Parameters
-    ----------
-    regressors : ndarray, shape (n, terms)
-        Regressors in the columns.
-    values : ndarray, shape (n,)
-        Values to which the regressors are fitted.
-    """
-    scale = np.maximum(np.linalg.norm(regressors, axis=0), 1e-300)
-    found = np.linalg.lstsq(regressors / scale, values, rcond=1e-10)[0]
-    return np.asarray(found / scale)
-
-
 def difference_equation_coefficients(
     shape: ThermalModelForm, coefficients: Floats, interval_s: float
 ) -> tuple[Floats, Floats, float]:

@@ -12,7 +12,6 @@ from monitor.drift.thermal.thermal_response import (
     build_regressors,
     compute_lag_roots,
     difference_equation_coefficients,
-    solve_least_squares,
 )
 
 TEMPERATURE_SERIES = np.random.default_rng(3).standard_normal(200).cumsum()
@@ -48,9 +47,3 @@ def test_initial_states_decay_with_the_lag_roots():
     columns = build_regressors(shape, TEMPERATURE_SERIES, 1.0, with_initial_state=True)
     assert columns.shape == (200, 5)
     np.testing.assert_allclose(columns[1, -2:], compute_lag_roots(shape, 1.0))
-
-
-def test_least_squares_is_accurate_for_columns_of_different_size():
-    columns = build_regressors(ThermalModelForm(3, (4.0,)), TEMPERATURE_SERIES, 1.0)
-    want = np.array([1e-3, 2e-5, -3e-6, 1e-9, 4e-5])
-    np.testing.assert_allclose(solve_least_squares(columns, columns @ want), want, rtol=1e-6)
