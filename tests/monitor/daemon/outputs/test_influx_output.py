@@ -393,7 +393,7 @@ def test_token_that_the_server_echoes_is_neither_in_the_state_nor_in_the_log(
     with run_database() as database, capture_logs() as log, run_output(database.url, tmp_path / "token") as output:
         database.status, database.message = status, ECHOES[notation]
         publish_status(output, 1)
-        wait_for(lambda: output.state != "ok")
+        wait_for(lambda: output.state != "ok" and log_lines(log, database.url.split("/")[2]))
         texts = [output.state, *(text for _, text in log_lines(log, database.url.split("/")[2]))]
     assert len(texts) >= 2
     for text in texts:
