@@ -161,8 +161,8 @@ def main() -> None:
         run()
     except SystemExit as end:
         others = [one for one in threading.enumerate() if one is not threading.main_thread()]
-        if others and isinstance(end.code, int) and all(one.daemon for one in others):
-            _exit_beside_threads(end.code)
+        if others and not isinstance(end.code, str) and all(one.daemon for one in others):
+            _exit_beside_threads(int(end.code or 0))
         raise
 
 

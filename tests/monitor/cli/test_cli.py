@@ -1290,9 +1290,10 @@ def test_signal_stops_the_daemon_cleanly(tmp_path: Path, command: str, number: i
     assert not Path(port).exists()  # the simulated port has been removed
 
 
-def test_thread_that_computes_does_not_abort_the_program_at_its_end() -> None:
+@pytest.mark.parametrize(("result", "status"), [(None, 0), (3, 3)])  # None is the result of the commands of the daemon
+def test_thread_that_computes_does_not_abort_the_program_at_its_end(result: int | None, status: int) -> None:
     """A thread that is in a transform when the interpreter ends would abort the process with SIGABRT."""
-    source = """
+    source = f"""
 import atexit, threading
 import numpy as np
 import scipy.fft
@@ -1308,14 +1309,14 @@ def command(**_):
     atexit.register(print, "orderly")
     threading.Thread(target=transform, daemon=True).start()
     started.wait()
-    return 3
+    return {result}
 monitor.cli.app = command
 imu_monitor.main()
 """
     run = subprocess.run(
         [sys.executable, "-c", source], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
-    assert (run.returncode, run.stdout, run.stderr) == (3, "orderly\n", "")
+    assert (run.returncode, run.stdout, run.stderr) == (status, "orderly\n", "")
 
 
 @pytest.mark.long
