@@ -1,4 +1,4 @@
-"""Share of missing samples, and by how much the missing samples widen the intervals of the noise coefficients."""
+"""Share of missing samples, and their effect on the width of the intervals of the noise coefficients."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -149,9 +149,9 @@ def add_hadamard_squares(ring: PhaseRing, m: int, sums: Floats, extra: Floats, t
                 sums[lane] += e * e
                 terms[lane] += 1
                 continue
-            older = missing_between(missing[u, lane], missing[v, lane])
-            middle = missing_between(missing[v, lane], missing[w, lane])
-            newer = missing_between(missing[w, lane], missing[x, lane])
+            older = missing_between(missing[v, lane], missing[u, lane])
+            middle = missing_between(missing[w, lane], missing[v, lane])
+            newer = missing_between(missing[x, lane], missing[w, lane])
             if older > most or middle > most or newer > most:
                 continue
             older_share, middle_share, newer_share = 1.0 / (m - older), 1.0 / (m - middle), 1.0 / (m - newer)

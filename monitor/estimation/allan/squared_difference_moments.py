@@ -83,8 +83,11 @@ def _integrate_to_phase(values: Floats, pauses: Ints) -> PhaseRing:
 
 
 @inlined
-def missing_between(older: np.integer | int, newer: np.integer | int) -> int:
-    """Return the difference of two elements of the running count of missing samples, which may wrap around."""
+def missing_between(newer: np.integer | int, older: np.integer | int) -> int:
+    """Return the difference of two elements of the running count of missing samples, which may wrap around.
+
+    The function is also correct for 64-bit counts, which pauses may increase by more than 2³¹.
+    """
     count = int(newer) - int(older)
     return count if count >= 0 else count + (1 << 32)
 

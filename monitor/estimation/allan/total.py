@@ -366,8 +366,8 @@ def _add_terms_with_missing(
         older, newer = 0, 0
         for lane in range(sums.size):
             start = missing[first, lane]
-            to_a, to_i = missing_between(start, missing[x, lane]), missing_between(start, missing[y, lane])
-            to_b, to_n = missing_between(start, missing[z, lane]), missing_between(start, missing[last, lane])
+            to_a, to_i = missing_between(missing[x, lane], start), missing_between(missing[y, lane], start)
+            to_b, to_n = missing_between(missing[z, lane], start), missing_between(missing[last, lane], start)
             if to_a != before_a or to_i != before_i or to_b != before_b or to_n != before_n:
                 before_a, before_i, before_b, before_n = to_a, to_i, to_b, to_n
                 older = to_i + to_a if left else to_i - to_a

@@ -1,4 +1,4 @@
-"""By how much missing samples widen the confidence intervals of the noise coefficients.
+"""Effect of missing samples on the width of the confidence intervals of the noise coefficients.
 
 The same fit is repeated twice with the fitted model in place of the measured Allan variances: with the numbers of terms
 and the excess of the actual missing samples, and with those of a complete record. Both fits therefore describe the same

@@ -48,7 +48,7 @@ def check_missing_rows(recording: RecordingUnderTest) -> CheckResult:
             "missing_rows",
             tuple(values),
             f"{rows} of {missing.size} rows are missing {where} for {duration_s:.3g} s. "
-            f"The missing samples were drawn with the spectrum of the noise.",
+            "The missing samples were drawn with the spectrum of the noise.",
             {"time": ParameterInterval(begin_s), "duration": ParameterInterval(duration_s)},
             {"rows": float(rows), "holes": float(holes), "share": rows / missing.size},
             corrected=True,
