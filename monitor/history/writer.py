@@ -51,6 +51,12 @@ MAX_RENAMED_FILES: Final = 10
 BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
+NOTED_CHANGES: Final = {
+    DELETED: "a new one was begun",
+    EMPTIED: "a new one was begun",
+    REPLACED: "results are added to that one",
+}
+"""Consequence of each change by another program that the status reports."""
 RENAMED_SUFFIX: Final = ".aside-"
 """Text between the name of a renamed history file and the time at which it was renamed."""
 
@@ -84,6 +90,8 @@ class HistoryWriter:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._store: HistoryFileWriter | None = None
+        self._last_store: HistoryFileWriter | None = None  # the open file, or the last one that was open
+        self._change = ""  # change by another program that has not been noted, because no file could be opened since
         self._thread = RestartedThread(self._run, "history", self._closing)
 
     @property
@@ -216,15 +224,15 @@ class HistoryWriter:
 
     def _current_store(self) -> HistoryFileWriter:
         """Return the open history file. If another program has changed the file, it is opened again."""
-        change = "" if self._store is None else self._store.describe_external_change()
-        if change:
+        if self._last_store is not None and self._change not in NOTED_CHANGES:
+            self._change = self._last_store.describe_external_change()
+        if self._change:
             self._close_store()
         if self._store is None:
-            self._store = HistoryFileWriter(self.path)
-        if change in (DELETED, EMPTIED):
-            self._set_note(f"{self.path} {change}; a new one was begun")
-        elif change == REPLACED:
-            self._set_note(f"{self.path} {change}; results are added to that one")
+            self._store = self._last_store = HistoryFileWriter(self.path)
+        if self._change in NOTED_CHANGES:
+            self._set_note(f"{self.path} {self._change}; {NOTED_CHANGES[self._change]}")
+        self._change = ""
         return self._store
 
     def _move_aside(self, error: UnusableHistory) -> bool:
@@ -247,6 +255,7 @@ class HistoryWriter:
         except OSError as failed:
             self._set_error(f"{error}; it cannot be moved: {_error_text(failed)}")
             return False
+        self._last_store, self._change = None, ""
         why = str(error).removesuffix(f"; {MOVE_HINT}")
         self._set_note(f"{why}; it was moved to {name}, and a new one was begun")
         return True

@@ -1,6 +1,7 @@
 """Tests of the writing thread of the history: errors, damaged or replaced files, and full disks."""
 
 import contextlib
+import errno
 import os
 import resource
 import shutil
@@ -197,6 +198,30 @@ def test_removed_or_changed_file_is_noticed_and_a_new_one_is_started(
             assert list_renamed_files(path)[0].read_bytes() == b"foreign" * 999
         case _ if "tables" in name:
             assert len(list_renamed_files(path)) == 1
+
+
+@pytest.mark.parametrize("failing", ["__init__", "merge_old_rows"])
+def test_deletion_is_noticed_although_the_file_cannot_be_used_at_that_moment(
+    failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that is being removed can be neither read nor written, until its removal has ended."""
+    _shorten_intervals(monkeypatch)
+    path = tmp_path / "h.sqlite"
+    works, failures = getattr(HistoryFileWriter, failing), iter([OSError(errno.EIO, "disk error")] * 2)
+
+    def fail_twice(*args, **options):
+        if error := next(failures, None):
+            path.unlink(missing_ok=True)
+            raise error
+        return works(*args, **options)
+
+    with start_writer(path) as writer:
+        queue_rows_and_events(writer, 10)
+        wait_for(lambda: writer.written == 20)
+        monkeypatch.setattr(HistoryFileWriter, failing, fail_twice)
+        if failing == "__init__":
+            path.unlink()
+        wait_for(lambda: "was deleted or renamed; a new one was begun" in writer.state)
 
 
 def test_other_history_in_place_of_the_file_is_extended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
