@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 from difflib import SequenceMatcher, get_close_matches
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -50,6 +51,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     return importlib.import_module(paths[name])
 
 
+@cache
 def _find_modules(package: ModuleType, suffix: str) -> dict[str, str]:
     """Return the name without suffix and the import path of each module of a package and of its ``SUBPACKAGES``."""
     subpackages: tuple[str, ...] = getattr(package, "SUBPACKAGES", ())

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor.common.compiled import compiled
+from monitor.common.compiled import compiled, inlined
 
 Floats = NDArray[np.float64]
 
@@ -192,12 +192,12 @@ def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
     ----------
     a, b : float
         Shape parameters, from 0.5 to 500.
-    x : float64 [...]
+    x : float64 [n]
         Argument, from 0 to 1.
 
     Returns
     -------
-    float64 [...]
+    float64 [n]
         I_x(a, b).
 
     Examples
@@ -211,30 +211,36 @@ def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
     y = np.where(other, 1.0 - x, x)
     with np.errstate(divide="ignore", under="ignore"):
         size = np.exp(front + p * np.log(y) + q * np.log1p(-y)) / p
-    part = np.where(y > 0.0, size * _fraction(p, q, y), 0.0)
+    part = np.where(y > 0.0, size * _continued_fraction(p, q, y), 0.0)
     return np.where(other, 1.0 - part, part)
 
 
-def _fraction(a: Floats, b: Floats, x: Floats) -> Floats:
-    c = np.ones(x.shape)
-    d = 1.0 / _away_from_zero(1.0 - (a + b) * x / (a + 1.0))
-    found = d
-    for m in range(1, 10_000):
-        for numerator in (
-            m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
-            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)),
-        ):
-            d = 1.0 / _away_from_zero(1.0 + numerator * d)
-            c = _away_from_zero(1.0 + numerator / c)
-            found = found * (c * d)
-        if not (np.abs(c * d - 1.0) > FRACTION_TOLERANCE).any():
-            break
-    return found
+@compiled
+def _continued_fraction(a: Floats, b: Floats, x: Floats) -> Floats:
+    fractions = np.empty(x.size)
+    for i in range(x.size):
+        p, q, y = a[i], b[i], x[i]
+        c, d = 1.0, 1.0 / _away_from_zero(1.0 - (p + q) * y / (p + 1.0))
+        found = d
+        for m in range(1, 10_000):
+            even = m * (q - m) * y / ((p + 2 * m - 1.0) * (p + 2 * m))
+            d = 1.0 / _away_from_zero(1.0 + even * d)
+            c = _away_from_zero(1.0 + even / c)
+            found *= c * d
+            odd = -(p + m) * (p + q + m) * y / ((p + 2 * m) * (p + 2 * m + 1.0))
+            d = 1.0 / _away_from_zero(1.0 + odd * d)
+            c = _away_from_zero(1.0 + odd / c)
+            found *= c * d
+            if not abs(c * d - 1.0) > FRACTION_TOLERANCE:
+                break
+        fractions[i] = found
+    return fractions
 
 
-def _away_from_zero(x: Floats) -> Floats:
+@inlined
+def _away_from_zero(x: float) -> float:
     """Replace values near zero by TINY to prevent a division by zero."""
-    return np.where(np.abs(x) < TINY, TINY, x)
+    return TINY if abs(x) < TINY else x
 
 
 def student_quantile(df: int, probability: float) -> float:

@@ -93,8 +93,10 @@ def _call_refit() -> None:
 
 
 def _call_thermal_model() -> None:
+    from monitor.common.distributions import student_quantile
     from monitor.drift.thermal import interval_regression, thermal_response
 
+    student_quantile(1, 0.975)
     thermal_response.apply_first_order_lag(np.zeros(2), 0.5)
     interval_regression.whiten_columns(np.zeros((2, 1)), np.ones(2, np.bool_), interval_regression.NOISE_MODELS)
 

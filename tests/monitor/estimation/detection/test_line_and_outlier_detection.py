@@ -197,9 +197,12 @@ def simulate_low_passed_noise(rng, n):
     ],
 )
 def test_noise_has_no_lines(noise):
-    """At most one in a hundred may have a line; in a thousand of each kind, none had one."""
-    records = [noise(np.random.default_rng(seed), MIN_SPECTRUM_SAMPLES) for seed in range(200)]
-    assert sum(bool(find_lines(record)) for record in records) <= 2
+    """At most one in a hundred may have a line; in a thousand of each kind, none had one.
+
+    For rates of 1 to 3 %, this limit fails more often than a limit of 2 lines in 200 records.
+    """
+    for seed in range(100):
+        assert not find_lines(noise(np.random.default_rng(seed), MIN_SPECTRUM_SAMPLES)), seed
 
 
 # --- outliers --------------------------------------------------------------------------------------

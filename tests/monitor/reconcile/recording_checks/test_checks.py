@@ -31,15 +31,15 @@ def test_recordings_of_the_model_have_no_findings(model):
 
 
 @pytest.mark.long
-def test_at_most_one_of_a_thousand_recordings_of_the_model_has_a_finding(monkeypatch):
-    found = 0
+def test_no_recording_of_600_of_the_model_has_a_finding(monkeypatch):
+    """None of 600 rejects a rate of 5 in 1000 with a probability of 95 %, as at most one of a thousand does."""
     for model in (MODEL, make_model()):
         simulated = checks._simulate(draw(model, 0), model, 1)  # the same for all seeds
         for y in simulated.values():
             y.flags.writeable = False
         monkeypatch.setattr(checks, "_simulate", lambda *_, simulated=simulated: simulated)
-        found += sum(bool(list_finding_kinds(draw(model, seed), model)) for seed in range(500))
-    assert found <= 1
+        for seed in range(300):
+            assert list_finding_kinds(draw(model, seed), model) == [], seed
 
 
 def test_without_a_model_a_clean_recording_has_no_findings():
