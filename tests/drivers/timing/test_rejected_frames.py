@@ -88,9 +88,9 @@ def receive(
 def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
     name: str, configured: bool, garbage_per_sample: int
 ) -> None:
-    """Garbage arrives at random times beside 10 s of samples, and a read contains about 30 ms of both."""
+    """Garbage arrives at random times beside 6 s of samples, and a read contains about 30 ms of both."""
     rng = np.random.default_rng(5)
-    n = 1000
+    n = 600
     good = send_samples(DECODERS[name](), n)
     sent_ns = START_NS + np.rint(np.arange(len(good)) * (n / len(good)) / RATE_HZ * 1e9)
     kinds = make_garbage(name, good, rng)
@@ -113,7 +113,7 @@ def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
     assert driver.counts.bad > 0
     assert driver.clock.measured_hz == pytest.approx(RATE_HZ, rel=0.005)
     assert driver.clock.contradicting_rate_hz is None
-    assert np.diff(t_ns[500:]) == pytest.approx(1e9 / RATE_HZ, abs=1e6)
+    assert np.diff(t_ns[300:]) == pytest.approx(1e9 / RATE_HZ, abs=1e6)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 0.003, 0.016])
