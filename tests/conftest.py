@@ -1,5 +1,6 @@
 """Start of the test session: kernels, number of parallel workers, and threads that must end with their test."""
 
+import gc
 import os
 import signal
 import threading
@@ -82,6 +83,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Skip the folders of the long tests if no long test is selected, because every worker would import them."""
     return True if collection_path.name in LONG_FOLDERS and "not long" in config.option.markexpr else None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keep the garbage collector from searching the hundreds of thousands of objects of ten thousand tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -193,14 +193,14 @@ def test_offline_commands_except_reconcile_need_no_extra(tmp_path: Path) -> None
         "sample_rate = 20.0\n[gz.angle_random_walk]\nN = 1e-4\n[gz.bandwidth_limit]\ncutoff = 5.0\norder = 2\n"
         "[gx.angle_random_walk]\nN = 1e-4\n"
     )
-    assert run_program(tmp_path, "simulate", "model.toml", "--seconds", 7200, "--out", "raw.npz", absent=absent) == (
+    assert run_program(tmp_path, "simulate", "model.toml", "--seconds", 2400, "--out", "raw.npz", absent=absent) == (
         0,
         "",
     )
     with np.load(tmp_path / "raw.npz") as file:
         columns = dict(file)
     t = np.arange(columns["gx"].size) / 20.0
-    temperature = 25.0 + 5.0 * np.sin(2.0 * np.pi * t / 3000.0)
+    temperature = 25.0 + 5.0 * np.sin(2.0 * np.pi * t / 1000.0)
     np.savez(tmp_path / "warm.npz", **{**columns, "gx": columns["gx"] + 1e-4 * temperature, "temperature": temperature})
     commands: list[tuple[object, ...]] = [
         ("analyze", "warm.npz", "--json", "result.json"),

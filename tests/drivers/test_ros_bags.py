@@ -67,7 +67,7 @@ class TestSamples:
         assert load_samples(storage_file(bag)).values.tobytes() == load_samples(bag).values.tobytes()
 
     def test_several_chunks(self, kind: str, tmp_path: Path) -> None:
-        n = 8000  # 2.5 MB; a chunk has 1 MB
+        n = 4500  # 1.4 MB; a chunk has 1 MB
         bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(n), noise(n))})
         assert load_samples(bag).values.tobytes() == noise(n).tobytes()
 
@@ -193,14 +193,14 @@ class TestJoin:
 
 
 class TestDamage:
-    @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.999])
-    def test_a_file_that_is_cut_off(self, kind: str, share: float, tmp_path: Path) -> None:
+    def test_a_file_that_is_cut_off(self, kind: str, tmp_path: Path) -> None:
         bag = write_bag(tmp_path, kind, {"/imu": imu_topic(times_ns(2000), noise(2000))})
         file = storage_file(bag)
         data = file.read_bytes()
-        file.write_bytes(data[: int(share * len(data))])
-        said = load_refused(bag)
-        assert "cut off" in said or "is no complete bag" in said
+        for share in (0.02, 0.3, 0.6, 0.9, 0.999):
+            file.write_bytes(data[: int(share * len(data))])
+            said = load_refused(bag)
+            assert "cut off" in said or "is no complete bag" in said, share
 
     @pytest.mark.parametrize(
         ("kind", "remedy"),

@@ -21,7 +21,7 @@ from tests.support.waiting import PATIENCE_S, wait_for
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
 RATE_HZ = 150.0
-STOPPED_SAMPLES = 3000
+STOPPED_SAMPLES = 2500
 """Number of samples that are sent while the process is stopped; the buffers hold 280 (UDP) and 1700 of them."""
 CONFIG = """
 [[device]]
@@ -117,6 +117,7 @@ def test_stopped_process_neither_bends_times_nor_loses_the_link(tmp_path: Path) 
     try:
 
         def wait_until_recorded(first: int) -> None:
+            wait_for(lambda: sensors.sent > first)
             wait_for(lambda: all(last >= first for last in newest()), lambda: f"{newest()}: {log.read_text()}")
 
         def newest() -> list[int]:
@@ -127,13 +128,13 @@ def test_stopped_process_neither_bends_times_nor_loses_the_link(tmp_path: Path) 
         wait_for(lambda: device in list_open_files(daemon.pid), log.read_text)
         sensors.start()
         wait_until_recorded(0)
-        wait_until_recorded(max(newest()) + 2000)
+        wait_until_recorded(max(newest()) + 1500)
         daemon.send_signal(signal.SIGSTOP)
         stopped = sensors.sent
         wait_for(lambda: sensors.sent >= stopped + STOPPED_SAMPLES)
         continued = sensors.sent
         daemon.send_signal(signal.SIGCONT)
-        wait_until_recorded(continued + 2000)
+        wait_until_recorded(continued + 1500)
     finally:
         daemon.send_signal(signal.SIGCONT)
         daemon.terminate()

@@ -50,7 +50,7 @@ class Sensors:
         self._masters = [terminal.master for terminal in terminals]
         for master in self._masters:
             os.set_blocking(master, False)
-        self._frames = encode_frames(RATE_HZ, 3600.0, "vectornav_binary")
+        self._frames = encode_frames(RATE_HZ, 900.0, "vectornav_binary")
         self.sent = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)

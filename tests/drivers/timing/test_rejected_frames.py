@@ -82,19 +82,19 @@ def receive(
     return driver, np.concatenate([row.t_ns for row in rows])
 
 
-@pytest.mark.parametrize("garbage_share", [0.0, 0.5, 0.99])
+@pytest.mark.parametrize("garbage_per_sample", [1, 20])
 @pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize("name", DECODERS)
 def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
-    name: str, configured: bool, garbage_share: float
+    name: str, configured: bool, garbage_per_sample: int
 ) -> None:
-    """Garbage arrives at random times beside 20 s of samples, and a read contains about 30 ms of both."""
+    """Garbage arrives at random times beside 6 s of samples, and a read contains about 30 ms of both."""
     rng = np.random.default_rng(5)
-    n = 2000
+    n = 600
     good = send_samples(DECODERS[name](), n)
     sent_ns = START_NS + np.rint(np.arange(len(good)) * (n / len(good)) / RATE_HZ * 1e9)
     kinds = make_garbage(name, good, rng)
-    count = min(int(n * garbage_share / (1.0 - garbage_share)), 40_000)
+    count = n * garbage_per_sample
     garbage = [kinds[i] for i in rng.integers(0, len(kinds), count)]
     at_ns = np.sort(rng.uniform(START_NS, sent_ns[-1], count))
     order = np.argsort(np.concatenate([sent_ns, at_ns]), kind="stable")
@@ -110,19 +110,20 @@ def test_garbage_beside_samples_is_bad_and_changes_nothing_else(
     driver.clock.compare_rates_at_end()
     assert driver.counts.received >= n - 1  # the last frame may not be complete
     assert driver.counts.lost == 0
-    assert driver.counts.bad > 0 or not count
+    assert driver.counts.bad > 0
     assert driver.clock.measured_hz == pytest.approx(RATE_HZ, rel=0.005)
     assert driver.clock.contradicting_rate_hz is None
-    assert np.diff(t_ns[500:]) == pytest.approx(1e9 / RATE_HZ, abs=1e6)
+    assert np.diff(t_ns[300:]) == pytest.approx(1e9 / RATE_HZ, abs=1e6)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 0.003, 0.016])
-@pytest.mark.parametrize("damaged_share", [0.01, 0.1, 0.4])
+@pytest.mark.parametrize(("damaged_share", "n"), [(0.01, 5000), (0.1, 2500), (0.4, 2500)])
 @pytest.mark.parametrize("configured", [True, False])
-def test_damaged_samples_keep_their_place_in_time(configured: bool, damaged_share: float, jitter_s: float) -> None:
+def test_damaged_samples_keep_their_place_in_time(
+    configured: bool, damaged_share: float, n: int, jitter_s: float
+) -> None:
     """Lines are damaged on the wire, so that each rejected line was a sample."""
     rng = np.random.default_rng(6)
-    n = 8_000
     good = send_samples(build_text(), n)
     damaged = rng.random(n) < damaged_share
     damaged[:100] = damaged[-1] = False
@@ -137,7 +138,7 @@ def test_damaged_samples_keep_their_place_in_time(configured: bool, damaged_shar
     assert (counts.received, counts.bad) == (n - damaged.sum(), damaged.sum())
     assert counts.lost <= 2
     assert driver.clock.measured_hz == pytest.approx(RATE_HZ, rel=0.005)
-    error_ns = (t_ns - arrived_ns[~damaged])[-3000:]
+    error_ns = (t_ns - arrived_ns[~damaged])[n // 2 :]
     assert np.ptp(error_ns) < 1e9 * (jitter_s + 0.004)
 
 

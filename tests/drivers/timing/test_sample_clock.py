@@ -3,6 +3,7 @@
 The true times and missing samples of each simulated stream are known.
 """
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -92,10 +93,8 @@ class TestCounter:
     @pytest.mark.parametrize(
         ("gaps", "delay"),
         [
-            ([], delay_randomly),
-            ([(5, 3)], delay_to_next_poll),
             ([(300, 1), (400, 10), (402, 1)], delay_randomly),
-            ([(900, 300)], delay_to_next_poll),
+            ([(5, 3), (900, 300)], delay_to_next_poll),
         ],
     )
     def test_missing_samples_are_counted_exactly(self, kind, rate, configured, gaps, delay):
@@ -161,7 +160,7 @@ class TestCounter:
         assert [kind for kind in take_event_kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
     def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, kind, rate, configured):
-        index, at, n = np.arange(int(28 * rate)), int(12 * rate), int(5 * rate)
+        index, at, n = np.arange(int(21 * rate)), int(12 * rate), int(5 * rate)
         ticks, arrived = compute_ticks(index, kind, rate), delay_randomly(START_S + index / rate)
         clock = SampleClock(CounterTimedFormat(*kind), rate if configured else None)
         out = feed(clock, arrived[:at], ticks[:at])
@@ -173,7 +172,7 @@ class TestCounter:
 
     @pytest.mark.parametrize("at_s", [1.0, 12.0])
     def test_loss_is_counted_if_the_device_restarts_during_a_disconnection(self, kind, rate, configured, at_s):
-        index, at, n = np.arange(int(28 * rate)), int(at_s * rate), int(5 * rate)
+        index, at, n = np.arange(int((at_s + 9) * rate)), int(at_s * rate), int(5 * rate)
         ticks, arrived = compute_ticks(index + 7000, kind, rate), delay_randomly(START_S + index / rate)
         fresh = (
             compute_ticks(index, kind, rate)
@@ -193,7 +192,7 @@ class TestCounter:
         assert take_event_kinds(clock) == ([] if kind[0] == 256 else ["clock_jumped"])
 
     def test_late_scheduler_loses_no_samples(self, kind, rate, configured):
-        index = np.arange(int(28 * rate))
+        index = np.arange(int(18 * rate))
         arrived = delay_to_next_poll(START_S + index / rate)
         asleep = np.flatnonzero((arrived > START_S + 12) & (arrived < START_S + 13))
         arrived[asleep] = START_S + 13 + np.arange(asleep.size) // 60 * 3e-4
@@ -256,7 +255,7 @@ def test_clock_adapts_to_a_new_rate_of_the_device():
 # --- arrival times alone
 
 
-@pytest.mark.parametrize("rate", [20.0, 99.32, 2000.0])
+@pytest.mark.parametrize("rate", [20.0, 99.32, 500.0])
 @pytest.mark.parametrize("delay", [delay_to_next_poll, delay_randomly])
 @pytest.mark.parametrize("configured", [True, False])
 def test_sample_times_do_not_contain_the_arrival_jitter(rate, delay, configured):
@@ -286,7 +285,7 @@ class TestArrival:
 
     @pytest.mark.parametrize("asleep_s", [0.2, 1.0, 2.5])
     def test_late_scheduler_loses_no_samples(self, rate, delay, configured, asleep_s):
-        arrived = delay(START_S + np.arange(int(28 * rate)) / rate)
+        arrived = delay(START_S + np.arange(int(20 * rate)) / rate)
         asleep = np.flatnonzero((arrived > START_S + 12) & (arrived < START_S + 12 + asleep_s))
         arrived[asleep] = START_S + 12 + asleep_s + np.arange(asleep.size) // 20 * 3e-4
         clock = self.clock(rate, configured)
@@ -296,7 +295,7 @@ class TestArrival:
 
     @pytest.mark.parametrize("gap_s", [[0.2], [0.5], [2.0], [0.5, 0.3]])
     def test_gaps_are_counted(self, rate, delay, configured, gap_s):
-        index = np.arange(int(30 * rate))
+        index = np.arange(int(20 * rate))
         kept = np.ones(index.size, bool)
         for i, length in enumerate(gap_s):
             at = int((12 + 1.5 * i) * rate)
@@ -322,7 +321,7 @@ class TestArrival:
 
     @pytest.mark.parametrize("at_s", [1.0, 12.0])
     def test_samples_during_a_disconnection_of_five_seconds_are_lost(self, rate, delay, configured, at_s):
-        arrived = delay(START_S + np.arange(int(30 * rate)) / rate)
+        arrived = delay(START_S + np.arange(int((at_s + 12) * rate)) / rate)
         at, n = int(at_s * rate), int(5 * rate)
         clock = self.clock(rate, configured)
         out = feed(clock, arrived[:at])
@@ -358,12 +357,13 @@ def test_fast_replay_without_counter_loses_no_samples(rate):
 
 @pytest.mark.long
 def test_sample_times_follow_a_drifting_oscillator():
-    index = np.arange(900 * 100)
-    taken = START_S + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)
-    clock = SampleClock(ArrivalTimedFormat(), 100.0)
+    rate = 24.7  # no multiple of the period is close to a multiple of the polling interval
+    index = np.arange(int(900 * rate))
+    taken = START_S + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / rate)
+    clock = SampleClock(ArrivalTimedFormat(), rate)
     out = feed(clock, delay_to_next_poll(taken))
     assert count_lost(out) == 0
-    off = join_times(out)[6000:] / NS_PER_S - taken[6000:]
+    off = join_times(out)[1500:] / NS_PER_S - taken[1500:]
     # the mean delay of the polling drifts by a quarter of its interval, and the regression lags by 30 s
     assert np.ptp(off) < 5e-3
 
@@ -623,12 +623,16 @@ def test_coarse_ticks_contradict_no_correct_rate():
     assert (clock.configured_or_measured_rate_hz, clock.contradicting_rate_hz) == (416.0, None)
 
 
-@pytest.mark.parametrize("delay", [delay_randomly, delay_to_next_poll, delay_by_stalls])
-@pytest.mark.parametrize("seed", range(5))
-def test_arrival_jitter_contradicts_no_rate_that_is_nearly_right(delay, seed):
-    taken = START_S + np.arange(3000) / 100.0
+@pytest.mark.parametrize(
+    "delay",
+    [
+        delay_to_next_poll,
+        *(partial(delay, seed=seed) for delay in (delay_randomly, delay_by_stalls) for seed in range(5)),
+    ],
+)
+def test_arrival_jitter_contradicts_no_rate_that_is_nearly_right(delay):
     clock = SampleClock(ArrivalTimedFormat(), 100.2)
-    arrived = delay(taken) if delay is delay_to_next_poll else delay(taken, seed=seed)
+    arrived = delay(START_S + np.arange(3000) / 100.0)
     for a in range(0, 3000, 10):
         feed(clock, arrived[a : a + 10])
         assert clock.contradicting_rate_hz is None

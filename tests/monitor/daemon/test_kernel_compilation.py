@@ -109,6 +109,24 @@ def test_compiling_child_ends_with_its_parent() -> None:
         assert child.wait(PATIENCE_S) == 0
 
 
+def test_warm_up_command_compiles_what_is_not_cached(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(compiled, "kernel_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(kernel_compilation, "kernel_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ECHO_ALL_LINES))
+    calls: list[str] = []
+    monkeypatch.setattr(kernel_groups, "GROUPS", (make_group(calls, "ab"),))
+    warm_up()
+    printed = capsys.readouterr()
+    assert printed.out.startswith("compiled 2 parts in ")
+    assert printed.out.endswith(f"; kernels are kept in {tmp_path}\n")
+    assert "compiling 2 of 2: " in printed.err
+    warm_up()
+    assert capsys.readouterr() == (f"nothing to compile; kernels are kept in {tmp_path}\n", "")
+    assert calls == ["a", "b"]
+
+
 def test_warm_up_command_reports_a_missing_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "kernel_cache_folder", lambda: None)
     with pytest.raises(ConfigError, match="no cache folder can be written; set NUMBA_CACHE_DIR"):
