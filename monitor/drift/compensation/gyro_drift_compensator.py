@@ -83,6 +83,7 @@ class CompensatorArrays(NamedTuple):
     bias: Floats  # [3] bias that is currently subtracted, rad/s; NaN if not known yet
     bank: Floats  # [3, filters + 1, 5] columns are defined in ``vehicle_rate_filter_bank``
     ages: Ints  # [3, filters, 2] columns are defined in ``vehicle_rate_filter_bank``
+    missing: Ints  # [3] number of missing samples since the last present sample
     feedback: Floats  # [3, 1] difference between input and output that must still be fed back
     waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums over the blocks that wait for a decision
     sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] ``square_sums`` of each waiting block
@@ -175,10 +176,8 @@ class Compensator:
         ndarray, shape (n, 6), float64
             Compensated samples in rad/s and m/s². The accelerometer values are unchanged.
         """
-        if lost:
-            for axis in range(GYROS):
-                predict_over_gap(self._state.bank[axis], self._state.ages[axis], lost)
-            self.sample_count += lost
+        self._state.missing[:] += lost
+        self.sample_count += lost
         out = np.array(values, dtype=np.float64, order="C")
         # Numba compiles a version for each memory layout and access flag, so the array is always contiguous and
         # read-only.
@@ -305,6 +304,7 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorArrays:
         bias=np.full(GYROS, np.nan),
         bank=np.zeros((GYROS, filters + 1, 5)),
         ages=np.zeros((GYROS, filters, 2), np.int64),
+        missing=np.zeros(GYROS, np.int64),
         feedback=np.zeros((GYROS, 1)),
         waiting=np.full((MAX_PENDING_BLOCKS, len(AXES), 5), -1.0),
         sums=np.zeros((MAX_PENDING_BLOCKS, GYROS, filters + 1, 2)),
@@ -360,9 +360,12 @@ def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorArrays, ke
     trusted = s.learned[axis] >= MIN_REST_INTERVALS
     for k in range(z.size):
         if z[k] != z[k]:
-            predict_over_gap(bank, ages, 1)
+            s.missing[axis] += 1
             out[k] = z[k]
             continue
+        if s.missing[axis] > 0:
+            predict_over_gap(bank, ages, s.missing[axis])
+            s.missing[axis] = 0
         rate = filter_rate_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
         if not trusted:
             rate, feedback[0] = z[k] - bias, 0.0

@@ -180,6 +180,8 @@ def predict_over_gap(bank: Floats, ages: Ints, missing_samples: int) -> None:
         if missing_samples >= 2 << j:
             ages[j, AGE] = ages[j, EXCEEDANCES] = 0
             bank[j + 1, SLOPE] = 0.0
+            # The first estimates after the reset are the measured rates, so the measured rate is preferred at first.
+            bank[j + 1, RESIDUAL] = max(bank[j + 1, RESIDUAL], bank[j + 1, REST_RESIDUAL] + bank[0, NOISE])
         else:
             bank[j + 1, RATE] += missing_samples * bank[j + 1, SLOPE]
 

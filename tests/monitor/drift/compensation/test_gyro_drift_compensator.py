@@ -130,6 +130,17 @@ def test_gaps_outliers_and_missing_values_do_not_disturb_the_bias():
     np.testing.assert_allclose(compensator.bias, 0.02, atol=1e-3)
 
 
+def test_lost_samples_equal_samples_that_are_nan():
+    values, missing = simulate_rest(60.0), 10
+    counted, marked = Compensator(RATE_HZ), Compensator(RATE_HZ)
+    for start in range(0, len(values), 100):
+        piece = values[start : start + 100].copy()
+        piece[:missing] = np.nan
+        expected = counted.compensate(piece[missing:], lost=missing)
+        np.testing.assert_array_equal(marked.compensate(piece[:4]), piece[:4])
+        np.testing.assert_array_equal(marked.compensate(piece[4:])[missing - 4 :], expected)
+
+
 def test_intervals_ended_by_a_gap_fit_into_their_buffer():
     """Compiled code does not check bounds, so an interval without space would overwrite other memory."""
     rng = np.random.default_rng(0)

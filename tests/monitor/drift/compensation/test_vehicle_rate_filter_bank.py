@@ -112,6 +112,16 @@ def test_gap_restarts_short_memories_and_bias_change_shifts_all():
     assert (bank.ages[4:, 0] == 500).all()
 
 
+def test_sample_after_a_gap_is_filtered_at_rest(trained_bank):
+    """A filter that has been reset returns its first sample unfiltered, so it must not be selected at once."""
+    rng = np.random.default_rng(5)
+    first = []
+    for _ in range(300):
+        predict_over_gap(trained_bank.bank, trained_bank.ages, 10)
+        first.append(trained_bank.filter_samples(SIGMA * rng.standard_normal(100), rest=True)[0])
+    assert np.std(first) < 0.2 * SIGMA
+
+
 def test_constant_rate_is_unchanged():
     bank = FilterBank()
     np.testing.assert_allclose(bank.filter_samples(np.full(3000, 0.25), rest=True), 0.25, atol=1e-12)

@@ -594,6 +594,18 @@ def test_slope_of_a_restarted_axis_uses_its_own_samples():
 # --- very long runs
 
 
+def test_counts_and_phase_that_wrap_around_leave_no_error():
+    """The count of missing samples passes 2³¹, as after 4·10¹⁰ samples with 5 % loss, and the phase passes 2⁶³."""
+    window, values = AllanWindow(LENGTH, FACTORS), simulate_values(2000)
+    values[np.random.default_rng(6).random(2000) < 0.05] = np.nan
+    values[1200:1350] = np.nan  # longer than the window
+    window._missing[:], window._phase[:] = 2**31 - 40, 2**63 - 2**20
+    for i in range(0, len(values), 25):
+        window.append_samples(values[i : i + 25])
+        check_against_batch(window, values[: i + 25])
+    assert window._missing.min() < 0
+
+
 @pytest.mark.long
 def test_ten_million_samples_with_gaps_and_a_transient_leave_no_error():
     """The benchmark runs 10⁹ samples; see docs/measurements/benchmarks.md."""
