@@ -76,7 +76,8 @@ def limit_terms_by_measured_avar(
     """Limit each coefficient so that no noise term alone exceeds a measured Allan variance.
 
     N is limited only by the Allan variance at τ of more than ``filter_memory`` samples. At shorter τ, a low-pass filter
-    in the sensor may have removed white noise.
+    in the sensor may have removed white noise. The contribution of missing samples is not subtracted from the limits,
+    because it is too large if the samples are missing periodically beside a line.
 
     Parameters
     ----------
@@ -95,7 +96,8 @@ def limit_terms_by_measured_avar(
         most = np.inf
         for i in rows:
             if unit_avar[i, a] > 0.0 and (a != N or unit_avar[i, N] * filter_memory < 1.0):
-                most = min(most, avar_upper_limit(avar[i], excess[i], edf[i], EXCLUSION_SIGMA) / unit_avar[i, a])
+                limit = avar_upper_limit(avar[i] + excess[i], 0.0, edf[i], EXCLUSION_SIGMA)
+                most = min(most, limit / unit_avar[i, a])
         most = np.sqrt(most)
         if terms.status[a] == 0 or terms.hi[a] <= most:
             continue

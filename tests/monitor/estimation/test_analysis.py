@@ -104,6 +104,17 @@ def test_excluded_motion_gives_the_coefficients_of_a_recording_without_these_row
     assert_same_coefficients(found, analyze(recorded_blocks(t[~moving], values[~moving]), 100.0))
 
 
+@pytest.mark.parametrize(("every", "line_hz"), [(50, 1.5725), (50, 20.0), (64, 3.1)])
+def test_periodic_loss_beside_a_line_lowers_no_limit_below_the_noise(every, line_hz):
+    """The missing samples have nearly the same phase, so the correction for missing samples is too large."""
+    index = np.arange(60_000)
+    values = white(60_000) + 1e-2 * np.sin(2.0 * np.pi * line_hz * index / 100.0)[:, None]
+    kept = index % every > 0
+    c = analyze(recorded_blocks(index[kept] / 100, values[kept], 10**6), 100.0).estimate.coefficients
+    assert (c.status[1] == Status.UPPER_BOUND).all()
+    assert (c.hi[1] > 1e-4).all()
+
+
 def test_very_long_gap_is_not_counted_among_the_short_gaps():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
