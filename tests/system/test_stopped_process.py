@@ -21,8 +21,8 @@ from tests.support.waiting import PATIENCE_S, wait_for
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")
 
 RATE_HZ = 150.0
-STOPPED_SAMPLES = 2500
-"""Number of samples that are sent while the process is stopped; the buffers hold 280 (UDP) and 1700 of them."""
+STOPPED_SAMPLES = 3000
+"""Number of samples that are sent while the process is stopped; the buffers hold up to 2730 (UDP) and 1700 of them."""
 CONFIG = """
 [[device]]
 name = "clock"
