@@ -357,19 +357,20 @@ def _begin_block(number: int, waiting: Floats, sums: Floats) -> None:
 def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorArrays, keep: float, out: Floats) -> None:
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
-    trusted = s.learned[axis] >= MIN_REST_INTERVALS
+    trusted, missing = s.learned[axis] >= MIN_REST_INTERVALS, s.missing[axis]
     for k in range(z.size):
         if z[k] != z[k]:
-            s.missing[axis] += 1
+            missing += 1
             out[k] = z[k]
             continue
-        if s.missing[axis] > 0:
-            predict_over_gap(bank, ages, s.missing[axis])
-            s.missing[axis] = 0
+        if missing > 0:
+            predict_over_gap(bank, ages, missing)
+            missing = 0
         rate = filter_rate_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
         if not trusted:
             rate, feedback[0] = z[k] - bias, 0.0
         out[k] = rate
+    s.missing[axis] = missing
 
 
 @compiled
