@@ -61,7 +61,7 @@ REVERSAL_FRACTIONS: Final = (0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)
 MIN_AGEING_FRACTION: Final = 0.003
 """Shortest time constant of a logarithmic drift, as a fraction of the recording length."""
 MIN_REFINED_SHARE: Final = 0.15
-"""Smallest gain for which a time constant is refined, relative to the penalty. Trials need twice this gain."""
+"""Smallest gain for which a time constant or cutoff is refined, relative to the penalty. Trials need twice this gain."""
 MAX_PEAKS: Final = 2
 POWER_LAW_EXPONENTS: Final = (0.4, 0.7, 1.0, 1.4, 1.8, 2.3, 2.8)
 FILTERS: Final = (
@@ -277,15 +277,20 @@ def fit_low_pass(axis: Axis, other_effects: Effects) -> BandwidthLimit | None:
     Returns
     -------
     BandwidthLimit or None
-        Filter with the fitted cutoff. None if the cutoff is half the sample rate.
+        Filter with the fitted cutoff. None if the cutoff is half the sample rate, or if no filter gains enough in the
+        first search.
     """
     nyquist = 0.5 * axis.rate_hz
+    unfiltered = axis.fit(other_effects).log_likelihood
     cutoffs = nyquist * np.geomspace(0.04, 0.95, 11)
     found: dict[BandwidthLimit, float] = {}
     for kind, order in FILTERS:
         floor = initial_effect_size(axis) / axis.rate_hz**0.5
         trials = [BandwidthLimit(cutoff=float(f), order=order, floor=floor, kind=kind) for f in cutoffs]
         best = _most_likely(axis, other_effects, trials)
+        gain = axis.candidate_log_likelihood((*other_effects, best)) - unfiltered
+        if gain < MIN_REFINED_SHARE * PENALTY_NATS[best.name]:
+            continue
         refined = fit_shape_parameter(axis, other_effects, best, "cutoff", 1.4)
         assert isinstance(refined, BandwidthLimit)
         for one, penalty in ((refined, FLOOR_PENALTY_NATS), (replace(refined, floor=None), 0.0)):
