@@ -30,7 +30,6 @@ LONG_FOLDERS: Final = {"benchmarks", "blind", "fuzz", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 
 SLOWEST_TESTS: Final = (
-    "test_warm_up_compiles_every_kernel_once_and_leaves_nothing_to_compile",
     "test_no_recording_of_600_of_the_model_has_a_finding",
     "test_commands_of_tutorial_print_what_it_shows",
     "test_wandering_lines_are_named",

@@ -1,7 +1,7 @@
-"""Tests that the warm-up compiles every kernel exactly once and leaves nothing to compile at a start.
+"""Test that the warm-up leaves nothing to compile at a start.
 
-The kernels come from the cache that the start of the test session has filled. The inner functions of a cached kernel
-are not visible, so type inference is repeated for them, without the generation of code.
+The kernels come from the cache that the start of the test session has filled. ``tests.support.kernels`` checks there
+that each kernel is compiled only once.
 """
 
 import subprocess
@@ -15,64 +15,20 @@ import monitor.common.compiled
 from tests.support.waiting import PATIENCE_S
 
 USE_ALL_KERNELS = """
-    import sys
-
     import numpy as np
-    from numba.core import compiler, event, typed_passes, typing
-    from numba.core.compiler_machinery import AnalysisPass, register_pass
-    from numba.core.registry import CPUDispatcher
+    from numba.core import event
 
     from drivers.data_types import make_block
     from monitor.daemon.kernels import kernel_groups
-    from monitor.common.compiled import Kernel
     from monitor.drift.compensation.gyro_drift_compensator import Compensator
     from monitor.drift.thermal import interval_regression, thermal_response
     from monitor.estimation.detection.motion_and_change_monitor import MotionAndChangeMonitor
     from monitor.estimation.estimator import Estimator
-
-
-    def find_kernels():
-        return {
-            f"{kernel.__module__}.{kernel.__name__}": kernel
-            for module in list(sys.modules.values())
-            for kernel in vars(module).values()
-            if module.__name__.startswith("monitor.") and isinstance(kernel, Kernel)
-        }
+    from tests.support.kernels import find_kernels
 
 
     def count_signatures():
         return {name: len(kernel.signatures) for name, kernel in find_kernels().items()}
-
-
-    @register_pass(mutates_CFG=False, analysis_only=True)
-    class EndAfterTypeInference(AnalysisPass):
-        _name = "end_after_type_inference"
-
-        def __init__(self):
-            super().__init__()
-
-        def run_pass(self, state):
-            signature = typing.signature(state.return_type, *state.args)
-            nothing = dict.fromkeys(compiler.CR_FIELDS)
-            state.cr = compiler.CompileResult(**nothing | {"signature": signature})
-            return False
-
-
-    class TypeInference(compiler.CompilerBase):
-        def define_pipelines(self):
-            passes = compiler.DefaultPassBuilder.define_untyped_pipeline(self.state)
-            passes.add_pass(typed_passes.NopythonTypeInference, "type inference")
-            passes.add_pass(EndAfterTypeInference, "end")
-            passes.finalize()
-            return [passes]
-
-
-    class InferringDispatcher(CPUDispatcher):
-        def __init__(self, kernel):
-            super().__init__(kernel.py_func, targetoptions=kernel.targetoptions, pipeline_class=TypeInference)
-
-        def add_overload(self, result):
-            self.overloads[tuple(result.signature.args)] = result
 
 
     recorder = event.RecordingListener()
@@ -116,21 +72,11 @@ USE_ALL_KERNELS = """
     assert found, "the samples must contain motion and changes"
     added = {name: count for name, count in count_signatures().items() if count != before.get(name)}
     assert not added, added
-    kernels = find_kernels()
-    for kernel in kernels.values():
-        kernel.intermediate = InferringDispatcher(kernel)
-    for kernel in kernels.values():
-        for signature in kernel.signatures:
-            InferringDispatcher(kernel).compile(signature)
-    counts = {name: (len(kernel.signatures), len(kernel.intermediate.overloads)) for name, kernel in kernels.items()}
-    repeated = {name: count for name, count in counts.items() if max(count) > 1}
-    assert not repeated, repeated
-    assert counts["monitor.estimation.allan.window_kernel.append_staged_samples"] == (1, 1)
 """
 
 
 @pytest.mark.long
-def test_warm_up_compiles_every_kernel_once_and_leaves_nothing_to_compile() -> None:
+def test_warm_up_leaves_nothing_to_compile() -> None:
     root = Path(monitor.common.compiled.__file__).parents[2]
     command = [sys.executable, "-c", textwrap.dedent(USE_ALL_KERNELS)]
     done = subprocess.run(command, cwd=root, timeout=PATIENCE_S, stderr=subprocess.PIPE, text=True, check=False)
