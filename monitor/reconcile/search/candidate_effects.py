@@ -61,7 +61,7 @@ REVERSAL_FRACTIONS: Final = (0.02, 0.04, 0.08, 0.15, 0.25, 0.4, 0.6)
 MIN_AGEING_FRACTION: Final = 0.003
 """Shortest time constant of a logarithmic drift, as a fraction of the recording length."""
 MIN_REFINED_SHARE: Final = 0.15
-"""Smallest gain for which a time constant or cutoff is refined, relative to the penalty. Trials need twice this gain."""
+"""Smallest gain, relative to the penalty, for which a parameter of shape is refined. Trials need twice this gain."""
 MAX_PEAKS: Final = 2
 POWER_LAW_EXPONENTS: Final = (0.4, 0.7, 1.0, 1.4, 1.8, 2.3, 2.8)
 FILTERS: Final = (
