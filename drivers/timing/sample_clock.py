@@ -265,7 +265,7 @@ class SampleClock:
             line = self._timeline.line
         found = line.measure_rate(final) if self._check is not None and line is not None else None
         if self._check is not None and found is not None:
-            self._check.compare_with_measured_rate(*found)
+            self._check.compare_with_measured_rate(found.rate_hz, found.uncertainty)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """Assign sample times and count missing samples according to the timing of the wire format."""
