@@ -50,7 +50,7 @@ class RateChangeDetector:
     ...     if changed := detector.add_point(i, t_s, line):
     ...         break
     >>> i, round(changed.measure_rate().rate_hz, 3)
-    (1401, 50.0)
+    (1205, 50.0)
     """
 
     def __init__(self, losses_are_counted: bool) -> None:
