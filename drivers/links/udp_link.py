@@ -137,6 +137,8 @@ def _why_not_open(settings: Settings, error: Exception) -> str:
         return 'host is no address of this computer; ip -brief address lists them, and "0.0.0.0" means all of them'
     if number in (errno.EACCES, errno.EPERM):
         return "no permission; choose a port above 1023"
+    if number in (errno.EMFILE, errno.ENFILE):
+        return "too many open files; raise the limit (ulimit -n, or LimitNOFILE of the systemd unit)"
     return f"cannot be opened; host must be an address of this computer: {describe_error(error)}"
 
 

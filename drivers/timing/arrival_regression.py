@@ -1,7 +1,7 @@
 """Estimate the sample rate by a linear regression of arrival time on sample index."""
 
-from math import exp, inf, sqrt
-from typing import Final
+from math import exp, sqrt
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,15 @@ STANDARD_RATES_HZ: Final = np.array([
     6660, 8000, 16000, 32000,
 ])
 # fmt: on
+
+
+class RateEstimate(NamedTuple):
+    """Sample rate that was measured by a regression."""
+
+    rate_hz: float
+    uncertainty: float  # relative
+    residual_s: float  # standard deviation of the times about the regression line in s
+    spread_s: float  # standard deviation of the times in s
 
 
 class ArrivalRegression:
@@ -90,8 +99,8 @@ class ArrivalRegression:
         self._x0 += samples
         self._first_x += samples
 
-    def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
-        """Return the measured sample rate and its uncertainty.
+    def measure_rate(self, final: bool = False) -> RateEstimate | None:
+        """Return the measured sample rate and its uncertainty, or None if there are too few points.
 
         Delays with standard deviation s cause a relative error of at most s/S in the slope of the line, where S is the
         standard deviation of the times (Cauchy-Schwarz inequality). For the residuals of the regression, s/S = √(1/r² −
@@ -101,11 +110,6 @@ class ArrivalRegression:
         ----------
         final : bool
             True if no more points will be added. The minimum duration MIN_SPAN_S is then ignored.
-
-        Returns
-        -------
-        tuple of float, or None
-            Sample rate in Hz and its relative uncertainty, or None if there are too few points.
         """
         enough = (
             self._x0 - self._first_x >= MIN_SAMPLES - 1
@@ -114,8 +118,9 @@ class ArrivalRegression:
         )
         if not enough or not self._sxt > 0.0:
             return None
-        r2 = self._sxt * self._sxt / (self._sxx * self._stt) if self._stt > 0.0 else 0.0
-        return self._sxx / self._sxt, UNCERTAINTY_FACTOR * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
+        explained = self._sxt * self._sxt / self._sxx  # part of _stt on the line
+        residual_s, spread_s = sqrt(max(self._stt - explained, 0.0) / self._w), sqrt(explained / self._w)
+        return RateEstimate(self._sxx / self._sxt, UNCERTAINTY_FACTOR * residual_s / spread_s, residual_s, spread_s)
 
     def period_s(self) -> float | None:
         """Return the sample period in seconds. None if there is no nominal rate and there are too few points."""

@@ -24,11 +24,8 @@ from drivers.timing.rejected_frames import RejectedFrameTest
 
 CATCH_UP_S: Final = 3.0
 """Time in s after which a persistent delay of the arrivals means that samples are missing."""
-UNCOUNTED_LOSS_UNCERTAINTIES: Final = 3.0
-"""Factor on the uncertainty of a rate if lost samples are not counted. Losses also make the measured rate lower.
-
-In simulations with losses of 5 and 20 % in bursts, a rate was too low by up to 1.7 times its uncertainty.
-"""
+MIN_SUDDEN_CHANGE: Final = 0.05
+"""Minimum relative decrease of the sample rate that begins with a pause of the samples."""
 MIN_GAP_PERIODS: Final = 3.0
 """Shortest pause between arrivals that can indicate missing samples, in sample periods."""
 MIN_GAP_S: Final = 0.05
@@ -123,10 +120,10 @@ class ArrivalTimeline:
 
     def find_rate_change(self, index: float, t_s: float) -> None:
         """Add a prompt sample to the detector of rate changes, and adopt a new sample rate."""
-        changed = self.rate_changes.add_point(index, t_s, self.line.measure_rate())
+        changed = self.rate_changes.add_point(index, t_s, self.line)
         found = changed.measure_rate() if changed is not None else None
         if found is not None:
-            self.change_rate(found[0], changed)
+            self.change_rate(found.rate_hz, changed)
 
     def undelayed_period_s(self) -> float | None:
         """Return the sample period in s, estimated without delayed arrivals.
@@ -134,8 +131,8 @@ class ArrivalTimeline:
         Until a period has been measured, the configured period is returned.
         """
         found = self.line.measure_rate() if self.earliest_time.has_enough_arrivals else None
-        if found is not None and found[1] < PERIOD_TOLERANCE:
-            return 1.0 / found[0]
+        if found is not None and found.uncertainty < PERIOD_TOLERANCE:
+            return 1.0 / found.rate_hz
         return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
     def add_arrival_and_assign_times(self, samples: SampleBlock, missing: Ints) -> Ints:
@@ -314,12 +311,11 @@ class ArrivalTimeline:
             return 0
         found, is_slower = delay.line.measure_rate(), False
         if found is not None:
-            slower, uncertainty = 1.0 - found[0] * period_s, found[1]
-            if slower > self.rate_changes.min_change(CATCH_UP_S / period_s) + uncertainty:
-                self.change_rate(found[0], delay.line)
+            slower, uncertainty = 1.0 - found.rate_hz * period_s, self.rate_changes.uncertainties * found.uncertainty
+            if slower > MIN_SUDDEN_CHANGE + uncertainty:
+                self.change_rate(found.rate_hz, delay.line)
                 return 0
-            factor = 1.0 if self.rate_changes.losses_are_counted else UNCOUNTED_LOSS_UNCERTAINTIES
-            is_slower = slower > factor * uncertainty
+            is_slower = slower > uncertainty
         gap = _count_samples(delay.least_s, period_s, unit)
         delay.line.shift_points(gap)
         rest_s = behind_s - gap * period_s

@@ -137,10 +137,10 @@ class CounterGaps:
             self._clock_s += float(steps.sum()) * self._counter.tick_s
             self._clock_index += len(steps) + int(missing.sum())
             self.clock_line.add_point(self._clock_index, self._clock_s)
-            changed = self._rate_changes.add_point(self._clock_index, self._clock_s, self.clock_line.measure_rate())
+            changed = self._rate_changes.add_point(self._clock_index, self._clock_s, self.clock_line)
             found = changed.measure_rate() if changed is not None else None
             if found is not None:
-                self._timeline.change_rate(found[0])
+                self._timeline.change_rate(found.rate_hz)
         return missing
 
     def _adopt_new_step(self, before: float, newest: int) -> None:

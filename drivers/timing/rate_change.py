@@ -1,10 +1,12 @@
 """Detect a change of the sample rate from two consecutive windows of sample times.
 
-The rates of both windows have to differ from the rate before the windows, and to agree with each other. A window lasts
-until its rate can be measured, which takes at least 2 s and 20 samples. Samples that are lost without being counted
-change the rate of a window at random. The limit of such formats therefore depends on the number of samples and on the
-measured scatter of the windows, and is at least four standard deviations for losses of 5 % with a mean burst length of
-3 samples. If a fifth of the samples is suddenly lost without being counted, this is a change of the rate.
+The rates of both windows have to differ from the rate before the windows, and to agree with each other. Long windows
+detect changes above 2 % within 18 s, and short windows detect changes above 6 % within 6 s.
+
+Samples that are lost without being counted also change the rate. Losses at random times scatter the sample times about
+the regression line: the mean square of the residuals of a random walk with variance v per sample is v·n/15 after a
+regression over n samples. If losses reduce the rate by the share p, v is at least p. Losses therefore explain the lower
+of two rates if its residuals reach a part of this value.
 """
 
 from math import log, sqrt
@@ -13,18 +15,22 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from drivers.timing.arrival_regression import ArrivalRegression
+from drivers.timing.arrival_regression import ArrivalRegression, RateEstimate
 
-MIN_CHANGE: Final = 0.05
-"""Minimum relative change of the rate. Slowly varying delays of the arrivals cause smaller changes."""
-SCATTER_FACTOR: Final = 5.0
-"""Limit of the relative change divided by the standard deviation of the windows, if losses are not counted."""
-MIN_SCATTER: Final = 0.09
-"""Minimum scatter, so that losses that begin after days without losses are no change of the rate."""
-SCATTER_WEIGHT: Final = 0.05
-"""Weight of the newest window in the measured scatter."""
-MAX_SQUARE: Final = 4.0
-"""Maximum square of a deviation, divided by the scatter. A single stall must not hide a later change of the rate."""
+WINDOWS_S: Final = (2.0, 6.0)
+"""Minimum lengths of the windows in s. A window lasts until its rate can be measured, which takes 20 samples."""
+MIN_SHIFT_S: Final = 0.12
+"""Minimum time in s by which a change of the rate shifts the samples of one window, equivalent to changes by 6 and 2 %.
+
+The oscillators of sensors are more accurate than 2 %, and slowly varying delays of the arrivals cause smaller shifts.
+"""
+UNCOUNTED_LOSS_UNCERTAINTIES: Final = 3.0
+"""Factor on the uncertainty of a rate if lost samples are not counted. Losses also make the measured rate lower.
+
+In simulations with losses of 5 and 20 % in bursts, a rate was too low by up to 1.7 times its uncertainty.
+"""
+MIN_LOSS_RESIDUALS: Final = 0.25
+"""Minimum mean square of the residuals that losses explain, divided by the expectation for single losses."""
 
 
 class RateChangeDetector:
@@ -37,31 +43,32 @@ class RateChangeDetector:
 
     Examples
     --------
-    >>> detector = RateChangeDetector(losses_are_counted=True)
-    >>> times_s = [min(i, 1000) * 0.01 + max(i - 1000, 0) * 0.02 for i in range(1500)]
-    >>> found = [detector.add_point(i, t, (100.0, 0.001)) for i, t in enumerate(times_s)]
-    >>> [round(line.measure_rate()[0], 3) for line in found if line is not None][0]
-    50.0
+    >>> detector, line = RateChangeDetector(losses_are_counted=True), ArrivalRegression()
+    >>> for i in range(1500):
+    ...     t_s = min(i, 1000) * 0.01 + max(i - 1000, 0) * 0.02
+    ...     line.add_point(i, t_s)
+    ...     if changed := detector.add_point(i, t_s, line):
+    ...         break
+    >>> i, round(changed.measure_rate().rate_hz, 3)
+    (1205, 50.0)
     """
 
     def __init__(self, losses_are_counted: bool) -> None:
-        self.losses_are_counted = losses_are_counted
-        self._scatter = MIN_SCATTER  # mean square of the relative deviation of a window, times its number of samples
+        self.uncertainties = 1.0 if losses_are_counted else UNCOUNTED_LOSS_UNCERTAINTIES
+        """Factor on the uncertainty of a rate."""
+        self._losses_are_counted = losses_are_counted
         self.restart()
 
     @property
     def steady_rate_hz(self) -> float | None:
         """Sample rate in Hz before the present windows, which a change that is not yet detected does not affect."""
-        return None if self._before is None else self._before[0]
+        return next((window.before.rate_hz for window in reversed(self._windows) if window.before), None)
 
     def restart(self) -> None:
-        """Discard both windows."""
-        self._line: ArrivalRegression | None = None  # regression of the newest window
-        self._first_index = 0.0
-        self._before: tuple[float, float] | None = None  # rate in Hz before the windows, and its uncertainty
-        self._candidate: tuple[float, float] | None = None  # rate of the last window, if the rate differs from _before
+        """Discard all windows."""
+        self._windows = [_Window(length_s) for length_s in WINDOWS_S]
 
-    def add_point(self, index: float, t_s: float, rate: tuple[float, float] | None) -> ArrivalRegression | None:
+    def add_point(self, index: float, t_s: float, line: ArrivalRegression) -> ArrivalRegression | None:
         """Add a point, and return the regression line of the newest window if the sample rate has changed.
 
         Parameters
@@ -70,39 +77,55 @@ class RateChangeDetector:
             Sample index.
         t_s : float
             Time of the sample in s.
-        rate : tuple of float, or None
-            Present sample rate in Hz and its relative uncertainty; None if unknown.
+        line : ArrivalRegression
+            Regression line of all samples.
         """
-        if self._line is None:
-            self._line, self._first_index = ArrivalRegression(), index
-            if self._candidate is None:
-                self._before = rate
-        line = self._line
-        line.add_point(index, t_s)
-        found = line.measure_rate()
-        if found is None:
-            return None
-        self._line = None
-        if self._before is None:
-            return None
-        samples = index - self._first_index
-        differs = self._differ(found, self._before, samples)
-        if differs and self._candidate is not None and not self._differ(found, self._candidate, samples):
-            return line
-        square = log(found[0] / self._before[0]) ** 2 * samples
-        change = min(square, MAX_SQUARE * self._scatter) - self._scatter
-        self._scatter = max(self._scatter + SCATTER_WEIGHT * change, MIN_SCATTER)
-        self._candidate = found if differs else None
+        for window in self._windows:
+            if self._add_to_window(window, index, t_s, line):
+                return window.line
         return None
 
-    def min_change(self, samples: float) -> float:
-        """Return the minimum relative change of the rate that is significant in a number of samples."""
-        if self.losses_are_counted:
-            return MIN_CHANGE
-        return max(MIN_CHANGE, SCATTER_FACTOR * sqrt(self._scatter / samples))
+    def _add_to_window(self, window: "_Window", index: float, t_s: float, line: ArrivalRegression) -> bool:
+        """Add a point to a window, and return True if the window shows a change of the sample rate."""
+        if window.ended:
+            window.line, window.ended = ArrivalRegression(), False
+            if window.candidate is None:
+                window.before, window.newest = window.newest, line.measure_rate()
+        window.line.add_point(index, t_s)
+        if t_s - window.line.first_t_s < window.length_s or (found := window.line.measure_rate()) is None:
+            return False
+        window.ended = True
+        if window.before is None:
+            return False
+        change, candidate = log(found.rate_hz / window.before.rate_hz), window.candidate
+        uncertainty = self.uncertainties * (found.uncertainty + window.before.uncertainty)
+        differs = abs(change) > max(MIN_SHIFT_S / window.length_s, uncertainty)
+        window.candidate = found if differs and not self._losses_explain(found, window.before) else None
+        if window.candidate is None or candidate is None:
+            return False
+        return abs(log(found.rate_hz / candidate.rate_hz)) < 0.5 * abs(change)
 
-    def _differ(self, a: tuple[float, float], b: tuple[float, float], samples: float) -> bool:
-        return abs(log(a[0] / b[0])) > max(self.min_change(samples), a[1] + b[1])
+    def _losses_explain(self, a: RateEstimate, b: RateEstimate) -> bool:
+        """Return True if the lower of two rates has the residuals of samples that are lost without being counted."""
+        if self._losses_are_counted:
+            return False
+        lower, higher = (a, b) if a.rate_hz < b.rate_hz else (b, a)
+        lost = 1.0 - lower.rate_hz / higher.rate_hz
+        # The times of n evenly spaced samples have the standard deviation n / (√12 rate).
+        expected_s2 = lost * sqrt(12.0) * lower.spread_s / (15.0 * lower.rate_hz)
+        return lower.residual_s**2 > MIN_LOSS_RESIDUALS * expected_s2
+
+
+class _Window:
+    """Window of sample times, and the rates before it."""
+
+    def __init__(self, length_s: float) -> None:
+        self.length_s = length_s
+        self.line = ArrivalRegression()
+        self.ended = True
+        self.before: RateEstimate | None = None  # rate before the previous window, in which the rate may have changed
+        self.newest: RateEstimate | None = None  # rate before this window
+        self.candidate: RateEstimate | None = None  # rate of the previous window, if it differs from ``before``
 
 
 def count_false_losses(old_periods: Floats, new_periods: Floats) -> int:

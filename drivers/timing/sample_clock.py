@@ -10,6 +10,7 @@ The wire format (``drivers.data_types.Timing``) determines which of three source
 Repeated rows are removed (``duplicate_rows``). Measured values are never changed.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -265,7 +266,7 @@ class SampleClock:
             line = self._timeline.line
         found = line.measure_rate(final) if self._check is not None and line is not None else None
         if self._check is not None and found is not None:
-            self._check.compare_with_measured_rate(*found)
+            self._check.compare_with_measured_rate(found.rate_hz, found.uncertainty)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """Assign sample times and count missing samples according to the timing of the wire format."""
@@ -274,7 +275,12 @@ class SampleClock:
         timeline = self._timeline
         # A counter needs the whole block, which shows its typical step.
         by_arrival = self._arrivals_are_timed and samples.ticks[0] == NO_TICK and (samples.ticks == NO_TICK).all()
-        batches = split_by_arrival_time(samples, timeline.origin_ns or 0) if by_arrival else [samples]
+        batches: Iterable[SampleBlock] = [samples]
+        if by_arrival:
+            batches = split_by_arrival_time(samples, timeline.origin_ns or 0)
+        elif timeline.data_were_dropped:  # before the longest pause, a counter may have wrapped unseen
+            at = int(np.argmax(np.diff(samples.t_ns, prepend=timeline.arrived_ns)))
+            batches = [samples[:at], samples[at:]] if at else [samples]
         t_ns, missing = [], []
         for batch in batches:
             missing.append(self._count_missing(batch))

@@ -91,8 +91,8 @@ class SenderTimeGapDetector:
             self._report_jumps(t, steps)
             jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S))
         period_s = self._period_s(steps)
-        if period_s and not jumps.size and abs(steps[-1] / NS_PER_S / period_s - 1.0) > STEP_TOLERANCE:
-            period_s = self._adopt_new_period(steps, period_s)
+        if period_s and not jumps.size and steps[-1] / NS_PER_S / period_s > 1.0 + STEP_TOLERANCE:
+            period_s = self._adopt_longer_period(steps, period_s)
         missing = self._count_missing(steps / NS_PER_S, period_s) if period_s else np.zeros(len(samples), np.int64)
         missing[0] = max(int(missing[0]), samples.lost)
         index = timeline.index + np.cumsum(missing + 1)
@@ -108,14 +108,17 @@ class SenderTimeGapDetector:
             self._keep_missing_times(t, missing, period_s)
         return retime_and_split_at_gaps(samples, t, missing)
 
-    def _adopt_new_period(self, steps: Ints, period_s: float) -> float:
-        """Return the sample period in s, which changes if most of the recent time steps agree on another period."""
+    def _adopt_longer_period(self, steps: Ints, period_s: float) -> float:
+        """Return the sample period in s, which changes if most of the recent time steps agree on a longer period.
+
+        Otherwise, the regression would see no change, because the steps would count as missing samples.
+        """
         timeline = self._timeline
         recent = np.concatenate([np.array(self._steps_s), steps / NS_PER_S])[-RATE_CHANGE_STEPS:]
         new_s = float(np.median(recent))
         near = np.count_nonzero(np.abs(recent / new_s - 1.0) < STEP_TOLERANCE) if new_s > 0.0 else 0
         regular = recent.size == RATE_CHANGE_STEPS and near >= MIN_NEW_STEPS
-        if not regular or abs(new_s / period_s - 1.0) < STEP_TOLERANCE or not timeline.line.has_enough_points_for_gaps:
+        if not regular or new_s / period_s < 1.0 + STEP_TOLERANCE or not timeline.line.has_enough_points_for_gaps:
             return period_s
         counted = recent[: max(recent.size - len(steps), 0)]
         self._timeline.false_losses += count_false_losses(counted / period_s, counted / new_s)

@@ -131,11 +131,13 @@ class WorkerService(Service):
         """Number of the newest applied configuration."""
 
     def receive_calls(self, connection: Connection) -> None:
-        """Execute calls from the main process until it requests a stop or exits."""
-        with suppress(EOFError, OSError):
-            while (call := connection.recv()).name != STOP:
-                self._execute(call)
-        self.request_stop()
+        """Execute calls from the main process until it requests a stop or exits, or until no call can be received."""
+        try:
+            with suppress(EOFError, OSError):
+                while (call := connection.recv()).name != STOP:
+                    self._execute(call)
+        finally:  # a worker that receives no calls, for example without free memory, would never end
+            self.request_stop()
 
     def _execute(self, call: Call) -> None:
         if call.name == RELOAD:

@@ -49,13 +49,59 @@ def test_changed_rate_is_reported_once_within_seconds(timing: Timing, configured
     assert lost == 0
 
 
+@pytest.mark.parametrize("new_hz", [91.0, 97.0, 103.0])
+@pytest.mark.parametrize("timing", [ArrivalTimedFormat(), SenderTimedFormat(), CounterTimedFormat(1 << 62, 1e-9)])
+def test_change_by_more_than_the_tolerance_of_an_oscillator_is_reported_once(timing: Timing, new_hz: float) -> None:
+    _, events, rates, lost = run(timing, True, new_hz)
+    assert [kind for kind, _ in events] == ["rate_changed"]
+    assert 0.0 < events[0][1] < 18.5
+    assert {contradicted for _, contradicted in rates} == {False, True}
+    assert [rate for rate, contradicted in rates if not contradicted] == [100.0]
+    assert [rate for rate, contradicted in rates if contradicted] == pytest.approx([new_hz], rel=3e-3)
+    assert lost == 0
+
+
 @pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize("timing", SENSORS.values(), ids=SENSORS)
 def test_rate_within_the_tolerance_of_an_oscillator_has_not_changed(timing: Timing, configured: bool) -> None:
-    clock, events, _, lost = run(timing, configured, 99.0)
+    clock, events, _, lost = run(timing, configured, 98.5)
     assert events == []
     assert lost == 0
     assert clock.contradicting_rate_hz is None
+
+
+def feed_without_counter(taken_s: np.ndarray, arrived_s: np.ndarray, timing: Timing) -> list[str]:
+    """Return the kinds of the events of samples without a counter."""
+    clock = SampleClock(timing, None)
+    for part in np.split(np.arange(taken_s.size), np.flatnonzero(np.diff(arrived_s)) + 1):
+        t_s = taken_s[part] if isinstance(timing, SenderTimedFormat) else arrived_s[part]
+        values = np.repeat(part[:, None] * 1e-3, 6, axis=1)
+        clock.assign_times(make_block(np.rint((START_S + t_s) * NS_PER_S).astype(np.int64), values))
+    return [event.kind for event in clock.take_events()]
+
+
+def test_losses_that_begin_and_end_are_no_change_of_the_rate() -> None:
+    """During every second minute of twenty minutes, 5 % of the samples are lost without being counted."""
+    rng = np.random.default_rng(1)
+    taken_s = np.arange(120_000) / 100.0
+    taken_s = taken_s[(rng.random(taken_s.size) > 0.05) | (taken_s % 120.0 < 60.0)]
+    arrived_s = np.ceil((taken_s + rng.uniform(0.0, 0.005, taken_s.size)) / 0.1) * 0.1
+    assert feed_without_counter(taken_s, arrived_s, ArrivalTimedFormat()) == []
+
+
+def test_slowly_varying_delays_are_no_change_of_the_rate() -> None:
+    """The delays vary by up to 100 ms within 6 s, which is a slope of up to 5 %."""
+    taken_s = np.arange(20_000) / 100.0
+    delay_s = 0.05 * (1.0 - np.cos(2.0 * np.pi * taken_s / 6.0)) * (taken_s > 20.0)
+    arrived_s = np.maximum.accumulate(np.ceil((taken_s + delay_s) / 0.05) * 0.05)
+    assert feed_without_counter(taken_s, arrived_s, ArrivalTimedFormat()) == []
+
+
+def test_sender_times_in_bursts_are_no_change_of_the_rate() -> None:
+    """A sender stamps the samples when it reads them, 20 samples every 200 ms, 2 ms apart."""
+    index = np.arange(20_000)
+    begun_s = index // 20 * 0.2
+    assert feed_without_counter(begun_s + index % 20 * 0.002, begun_s, SenderTimedFormat()) == []
 
 
 @pytest.mark.long

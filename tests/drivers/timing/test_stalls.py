@@ -114,8 +114,13 @@ class StarvedLink(PolledLink):
 @pytest.mark.parametrize("configured", [True, False])
 @pytest.mark.parametrize(
     ("columns", "capacity", "most", "stamped"),
-    [(["-", "gx"], 1300, 2600, False), (["counter", "gx"], 1300, 2600, False), (["-", "gx"], 280, 256, True)],
-    ids=["terminal", "terminal, 8-bit counter", "datagrams"],
+    [
+        (["-", "gx"], 1300, 2600, False),
+        (["counter", "gx"], 1300, 2600, False),
+        (["-", "gx"], 280, 256, True),
+        (["counter", "gx"], 280, 256, True),
+    ],
+    ids=["terminal", "terminal, 8-bit counter", "datagrams", "datagrams, 8-bit counter"],
 )
 def test_starved_process_does_not_move_samples_beside_an_overflow(
     columns: list[str], capacity: int, most: int, stamped: bool, configured: bool, monkeypatch: pytest.MonkeyPatch

@@ -1,11 +1,14 @@
 """Tests of the main process of a daemon with two workers: reload, commands and refused configurations."""
 
 import json
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import cast
 
 import pytest
 from structlog.testing import capture_logs
@@ -13,7 +16,7 @@ from structlog.testing import capture_logs
 from drivers.errors import ConfigError
 from monitor.daemon.workers import supervisor
 from monitor.daemon.workers.supervisor import WorkerSupervisor
-from monitor.daemon.workers.worker_service import Call
+from monitor.daemon.workers.worker_service import Call, PipeOutput, WorkerService
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -83,6 +86,21 @@ def test_calls_before_the_end_of_a_worker_are_not_lost() -> None:
     assert worker.receive() == last
     with pytest.raises(EOFError):
         worker.receive()
+
+
+def test_worker_that_can_receive_no_calls_stops(tmp_path: Path) -> None:
+    """Otherwise, the worker would neither obey nor end with the main process."""
+
+    class FullMemory:
+        def recv(self) -> Call:
+            raise MemoryError
+
+    ours, _ = Pipe()
+    config = loading.load_config(write(tmp_path, free_endpoint(), {"a": ""}))
+    service = WorkerService(config, PipeOutput(ours), os.getpid())
+    with pytest.raises(MemoryError):
+        service.receive_calls(cast(Connection, FullMemory()))
+    assert service._stop.is_set()
 
 
 @pytest.mark.long
