@@ -146,7 +146,7 @@ class Driver:
         self._last_sample_s = 0.0
         self._last_read_s = inf  # end of the last read, on a clock that includes the time in which the host sleeps
         self._newest_t_ns = 0
-        self._unreported_samples = self._unreported_gaps = 0  # missing samples and gaps since the last report
+        self._unreported_samples = 0  # missing samples since the last report
         self._reported_datagrams = 0  # number of dropped datagrams that have been reported
         self._last_report_s = -LOSS_REPORT_INTERVAL_S
 
@@ -255,7 +255,7 @@ class Driver:
         self._count_decoder_drops()
         if false_losses := self.clock.take_false_losses():
             self.counts.lost = max(self.counts.lost - false_losses, 0)
-            self._unreported_samples = self._unreported_gaps = 0
+            self._unreported_samples = 0
         self._report_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
@@ -282,15 +282,13 @@ class Driver:
         if stamped.lost:
             self.counts.lost += max(0, stamped.lost - dropped)
             self._unreported_samples += stamped.lost
-            self._unreported_gaps += 1
 
     def _report_lost(self) -> None:
         """Report missing samples at most once per second, so that the queue has room for other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
-        places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
-        self._event("samples_lost", f"{self._unreported_samples} samples missing{places}{self._describe_dropped()}")
-        self._unreported_samples = self._unreported_gaps = 0
+        self._event("samples_lost", f"{self._unreported_samples} samples missing{self._describe_dropped()}")
+        self._unreported_samples = 0
         self._last_report_s = time.monotonic()
 
     def _describe_dropped(self) -> str:

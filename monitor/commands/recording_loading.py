@@ -159,7 +159,7 @@ def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Re
     columns |= {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     columns["temperature"] = np.concatenate([one.temperature_c for one in blocks])
     stated_hz = None if rate_hz is None else clock.configured_or_measured_rate_hz
-    notes = (*link.notes, *_describe_losses(blocks, decoder, clock))
+    notes = (*link.notes, *_describe_rejected_data(decoder, clock))
     return replace(create_recording(columns, stated_hz, str(path)), notes=notes)
 
 
@@ -190,11 +190,8 @@ def _size_bytes(path: Path) -> int:
     return sum(one.stat().st_size for one in files if one.is_file())
 
 
-def _describe_losses(blocks: list[SampleBlock], decoder: Decoder, clock: SampleClock) -> Iterator[str]:
-    """Yield notes about missing, rejected and repeated samples, and about the clock."""
-    lost = [one.lost for one in blocks if one.lost]
-    if lost:
-        yield f"{format_count(sum(lost), 'sample')} missing in {format_count(len(lost), 'place')}."
+def _describe_rejected_data(decoder: Decoder, clock: SampleClock) -> Iterator[str]:
+    """Yield notes about rejected frames and repeated samples, and about the clock."""
     if decoder.bad:
         why = f": {decoder.recent_problem}" if decoder.recent_problem else ""
         yield f"{format_count(decoder.bad, 'frame')} rejected{why}."

@@ -51,7 +51,9 @@ UNEVEN_STEP_SHARE: Final = 0.5
 """Minimum reported deviation of the 10 % and 90 % quantiles of the time steps, as a fraction of the sample period."""
 
 
-def place_samples_on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
+def place_samples_and_pauses_on_grid(
+    blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> tuple[Floats, Ints, float, list[str]]:
     """Place the samples of a recording on a regular time grid, with NaN for missing samples.
 
     Parameters
@@ -65,31 +67,12 @@ def place_samples_on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) 
     -------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
+    pauses : ndarray of int64
+        Rows that replace a gap of more than ``MAX_GAP_SAMPLES`` samples.
     rate_hz : float
         Sample rate in Hz.
     notes : list of str
-        Notes for the user on irregularities of the time stamps and the values.
-    """
-    _, _, values, rate, notes = _resample(blocks, rate_hz)
-    return values, rate, notes
-
-
-def place_samples_and_pauses_on_grid(
-    blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> tuple[Floats, Ints, float, list[str]]:
-    """Place the samples of a recording on a regular time grid, and find the rows that stand for a long gap.
-
-    Parameters
-    ----------
-    blocks, rate_hz
-        See ``place_samples_on_grid``.
-
-    Returns
-    -------
-    values, rate_hz, notes
-        See ``place_samples_on_grid``.
-    pauses : ndarray of int64
-        Rows that replace a gap of more than ``MAX_GAP_SAMPLES`` samples, returned after ``values``.
+        Notes for the user on irregularities of the time stamps and the values, other than the missing samples.
     """
     stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
     begins = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
@@ -105,22 +88,27 @@ def place_samples_and_temperature_on_grid(
     Parameters
     ----------
     blocks, rate_hz
-        See ``place_samples_on_grid``.
+        See ``place_samples_and_pauses_on_grid``.
 
     Returns
     -------
-    values, rate_hz, notes
-        See ``place_samples_on_grid``.
+    values, rate_hz
+        See ``place_samples_and_pauses_on_grid``.
     temperature_c : ndarray of float64, shape (n,)
         Temperature in °C, returned after ``values``; NaN means not measured.
+    notes : list of str
+        See ``place_samples_and_pauses_on_grid``. The last note states the share of the missing samples.
     """
     stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
-    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
+    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
     parts = [
         part
-        for samples, hole in zip(stamped, missing, strict=True)
+        for samples, hole in zip(stamped, missing.tolist(), strict=True)
         for part in (np.full(hole, np.nan), samples.temperature_c)
     ]
+    if missing.any():
+        share = format_two_significant_digits(100.0 * float(missing.sum()) / len(values))
+        notes.append(f"{share} % of the samples are missing")
     return values, np.concatenate(parts), rate, notes
 
 
@@ -129,9 +117,11 @@ def _resample(
 ) -> tuple[list[SampleBlock], Ints, Floats, float, list[str]]:
     stamped, lost, rate, notes = _stamp(blocks, rate_hz)
     values = _place_on_grid(stamped, lost)
-    notes += (
-        _repeated_notes(values) + _resolution_notes(find_coarsely_quantized_axes(values)) + _missing_notes(lost, rate)
-    )
+    notes += _repeated_notes(values) + _resolution_notes(find_coarsely_quantized_axes(values))
+    notes += [
+        f"a pause of {n / rate:.6g} s is too long to be kept and is replaced by one missing sample"
+        for n in lost[lost > MAX_GAP_SAMPLES]
+    ]
     return stamped, lost, values, rate, notes
 
 
@@ -203,18 +193,6 @@ def _contiguous(parts: Sequence[Floats]) -> Floats | None:
 
 def _address(array: Floats) -> int:
     return int(array.__array_interface__["data"][0])
-
-
-def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
-    long, short = lost[lost > MAX_GAP_SAMPLES], lost[(lost > 0) & (lost <= MAX_GAP_SAMPLES)]
-    notes = [
-        f"a pause of {n / rate_hz:.6g} s is too long to be kept and is replaced by one missing sample" for n in long
-    ]
-    if short.size:
-        samples = "1 sample is" if short.sum() == 1 else f"{short.sum()} samples are"
-        places = "1 place" if short.size == 1 else f"{short.size} places"
-        notes.append(f"{samples} missing in {places}")
-    return notes
 
 
 def _late_notes(late: int) -> list[str]:

@@ -6,10 +6,11 @@ therefore does not depend on how the samples are distributed over calls.
 - **Haar differences.** In octave j, the means of two successive blocks of m = 2^j samples give the Haar difference z =
   (mean − mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, the
   differences are independent. The computation takes two additions per sample and axis.
-- **Missing samples.** The mean of a block is the mean of its samples that are present, if these are at least 60 %. The
-  expectation of z² is then σ²(m) + e V(m), with the symbols of ``allan.missing_samples``. V and σ² are taken from the
-  reference, and z² is divided by 1 + e V/σ². Loss therefore changes no variance. For white noise, V/σ² = m. If missing
-  samples cause most of z², as with a strong spectral line, z² is ignored.
+- **Missing samples.** Single samples are paired with the next sample that is present, also across one missing sample.
+  The mean of a longer block is the mean of its present samples, if these are at least 60 %. The expectation of z² is
+  then σ²(m) + e V(m), with the symbols of ``allan.missing_samples``. V and σ² are taken from the reference, and z² is
+  divided by 1 + e V/σ². Loss therefore changes no variance. For white noise, V/σ² = m. If missing samples cause most of
+  z², as with a strong spectral line, z² is ignored.
 - **Evidence.** Let S be the sum of the n squares z² since the start of the reference, and S₁ the sum of the n₁ squares
   since a suspected change. The evidence g is the log-likelihood ratio of the hypotheses "variance multiplied by r" and
   "no change":
@@ -18,11 +19,14 @@ therefore does not depend on how the samples are distributed over calls.
 
   The evidence does not depend on the unknown variance. With a long reference, g is Page's CUSUM. Without a change, the
   mean of e^g is 1, so the probability of an alarm at threshold h within k tests is at most k e^−h (Shiryaev–Roberts).
-  If g ≤ 0, the time of the suspected change is set to the current sample.
+  If (1 − 1/r) S₁/n₁ ≤ ln(r) S/n, the squares fit the old variance better, and the time of the suspected change is set
+  to the current sample. The condition g ≤ 0 is not sufficient. If S₁ contains most of S, g hardly changes, so a
+  suspicion from the first samples would remain, and would hide a later change.
 - **Non-Gaussian and correlated noise.** The squares z² are clipped at ``CLIP`` times the reference variance, which
   corresponds to 4σ. For Gaussian noise, clipping affects a share of 6e-5 of the squares and reduces their mean by 2e-4.
   The evidence is divided by the factor F by which the variance of sums of z² exceeds the variance for independent
-  Gaussian noise. Heavy tails, spectral lines and coarse resolution increase F.
+  Gaussian noise. Heavy tails, spectral lines and coarse resolution increase F. The value of F at the time of the
+  suspected change is used, because the change itself increases F.
 - **Bias steps** are detected by comparing the mean of a pair of blocks with the mean of the second pair before it. The
   pair in between may contain the step.
 """
@@ -77,6 +81,8 @@ MIN_SPREAD_PAIRS: Final = 8
 """Minimum number of pairs of sums from which the factor F is estimated."""
 MIN_INFORMATION: Final = 0.5
 """Minimum share of the expectation of z² that is not caused by missing samples. For white noise, the share is ≥ 0.6."""
+MAX_GAP_RATIO: Final = 1.5
+"""Maximum ratio of the mean squares of differences between successive samples and across one missing sample."""
 MAX_FLANK: Final = 12.0
 """Maximum ratio of the squared Haar differences before and after a step to the reference variance."""
 CONFIRM_PAIRS: Final = 2
@@ -86,11 +92,15 @@ SLOTS: Final = 4
 NEVER: Final = 1 << 62
 """Sample number that means "no decision is due"."""
 
-N, S, LIMIT, SEEDED, F = range(5)
-"""Columns of ``ChangeState.band``, which contains the reference."""
+N, S, LIMIT, SEEDED, F, GAP_N, GAP_S = range(7)
+"""Columns of ``ChangeState.band``, which contains the reference.
+
+They contain the number and the sum of clipped z², the clip level, the number of values in ``seeds``, F, and the number
+and the sum of clipped z² of differences across one missing sample.
+"""
 UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
 """Columns of ``ChangeState.unit`` and ``ChangeState.cum``, which contain sums of squared differences."""
-N1, S1, SINCE, G = range(4)
+N1, S1, SINCE, G, ONSET_F = range(5)
 """Columns of ``ChangeState.cusum``, which contains the evidence for changes."""
 HELD, TERMS, SQUARES, COUNT, SPREAD = range(5)
 """Columns of ``ChangeState.spread``, from which the factor F is computed."""
@@ -117,12 +127,12 @@ class ChangeState(NamedTuple):
     fill: Ints  # [A, J] number of complete block pairs for step detection; −1 excludes the current pair
     ring: Floats  # [A, J, 2, 3] mean, difference and information of the last two block pairs
     seeds: Floats  # [A, J, SEED] first squared Haar differences z²
-    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of values in ``seeds``, F
+    band: Floats  # [A, J, 7] reference; columns from N to GAP_S
     unit: (
         Floats  # [A, J, 5] since the last test: number, sum of clipped z², sum of z², number below the median, extremes
     )
     cum: Floats  # [A, J, 5] columns of ``unit`` since the start
-    cusum: Floats  # [A, J, 6, 4] n₁, S₁, time of the suspected change, evidence g
+    cusum: Floats  # [A, J, 6, 5] n₁, S₁, time of the suspected change, evidence g, factor F at this time
     spread: Floats  # [A, J, L, 5] for the factor F: stored sum of z², its terms or 0, squared differences, pairs, F
     burst: Floats  # [A, 2] CUSUM of extreme values, and the last sample at which it was zero
     alarm: Floats  # [A, 5] pending alarm, with the columns from KIND to DUE; kind 0 means no alarm
@@ -138,7 +148,7 @@ def make_change_state(octaves: int) -> ChangeState:
         np.zeros(7), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
         np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 3)),
         np.zeros((a, j, SEED)),
-        np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
+        np.zeros((a, j, 7)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 5)),
         np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 5)), np.zeros((a, 6)),
         np.zeros((40, SLOTS, a, j, 5)), np.full((40, SLOTS), -1, np.int64),
     )  # fmt: skip
@@ -268,13 +278,46 @@ def _differences_of_present(
     the blocks.
     """
     m, ratio = 1 << j, _variance_ratio_within(band, axis, j)
+    if j == 0:
+        _differences_of_neighbours(sums, present, band, unit, seeds, axis)
     for i in range(TICK_SAMPLES >> (j + 1)):
         sum1, sum2, count1, count2 = sums[2 * i], sums[2 * i + 1], present[2 * i], present[2 * i + 1]
         sums[i], present[i] = sum1 + sum2, count1 + count2
         information = _information(count1, count2, m, ratio)
-        if information >= MIN_INFORMATION:
+        if j > 0 and information >= MIN_INFORMATION:
             d = sum2 / count2 - sum1 / count1
             _gather(band, unit, seeds, axis, j, 0.5 * d * d * information)
+
+
+@compiled
+def _differences_of_neighbours(
+    sums: Floats, present: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int
+) -> None:
+    """Add the squared Haar differences of single samples, of which each is paired with the next one that is present.
+
+    A pair may have one missing sample in between. The squares of such pairs are scaled by the ratio of the mean squares
+    of both kinds of pairs, if this ratio is known and the noise is nearly white.
+    """
+    one = band[axis, 0]
+    scale = 0.0
+    if one[GAP_N] >= SETTLED and one[GAP_S] > 0.0:
+        scale = one[S] / one[N] * one[GAP_N] / one[GAP_S]
+        if not 1.0 / MAX_GAP_RATIO < scale < MAX_GAP_RATIO:
+            scale = 0.0
+    first = -3
+    for i in range(TICK_SAMPLES):
+        if present[i] == 0.0:
+            continue
+        z2 = 0.5 * (sums[i] - sums[first]) ** 2
+        paired = i - first == 1
+        if i - first == 2 and one[SEEDED] == SEED:
+            one[GAP_N] += 1.0
+            one[GAP_S] += min(z2, one[LIMIT])
+            z2 *= scale
+            paired = scale > 0.0
+        if paired:
+            _gather(band, unit, seeds, axis, 0, z2)
+        first = -3 if paired else i
 
 
 @compiled
@@ -442,11 +485,13 @@ def _raise_cusums(
     n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
     best, largest = -1, threshold
     for i in range(RATIOS.size):
+        if cusum[axis, j, i, N1] == 0.0:
+            cusum[axis, j, i, ONSET_F] = spread
         n1 = cusum[axis, j, i, N1] + k
         s1 = cusum[axis, j, i, S1] + q
-        g = -1.0  # By Jensen's inequality, g < 0 unless the variance has changed in the direction of r.
-        if (s1 * n - total * n1) * GAIN[i] > 0.0:
-            g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / spread
+        g = 0.0
+        if GAIN[i] * s1 * n > 2.0 * HALF_LOG[i] * n1 * total:
+            g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / cusum[axis, j, i, ONSET_F]
         if g <= 0.0:
             n1, s1 = 0.0, 0.0
             cusum[axis, j, i, SINCE] = now
@@ -467,7 +512,7 @@ def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
     since, evidence = s.cusum[axis, j, i, SINCE], s.cusum[axis, j, i, G]
     terms = s.band[axis, j, N] - s.cusum[axis, j, i, N1]
     length = min(terms * (2 << j), since - s.born[axis])
-    if terms >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2 and length >= s.levels[NOISE_LEARN_TIME]:
+    if terms >= MIN_REFERENCE_TERMS * s.cusum[axis, j, i, ONSET_F] ** 2 and length >= s.levels[NOISE_LEARN_TIME]:
         share = min(length / s.levels[LEARN_TIME], 1.0)
         if s.born[axis] == 0:
             share = max(share, FIRST_SHARE)

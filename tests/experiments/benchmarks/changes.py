@@ -1,6 +1,6 @@
 """False alarms, delays and classification of the change detector, for simulated years and changes.
 
-    python -m tests.experiments.benchmarks.changes [rate false delays steps cost] [--years 0.3]
+    python -m tests.experiments.benchmarks.changes [rate false delays steps loss cost] [--years 0.3]
 
 All alarms are alarms of the real detector on complete sample series. The 95 % intervals of counts are Poisson intervals
 (Garwood), and those of shares use √(p(1 − p)/n). A delay is the time from the onset to the alarm. The event is
@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
@@ -32,6 +33,26 @@ WHITE: Final = 1.5e-4
 RESOLUTION: Final = np.deg2rad(0.05)
 BLOCK_SAMPLES: Final = 100_000
 RATE_HZ: Final = 100.0
+
+
+def draw_loss(share: float, length: int = 1) -> Callable[[int, np.random.Generator], NDArray[np.bool_]]:
+    """Return a function that returns a mask [n], which is True for a share of the samples in bursts of a length."""
+
+    def lose(n: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+        begins = rng.random(n) < 1.0 - (1.0 - share) ** (1.0 / length)
+        return np.convolve(begins, np.ones(length))[:n] > 0.0
+
+    return lose
+
+
+LOSSES: Final = {
+    "none": draw_loss(0.0),
+    "1 % at random": draw_loss(0.01),
+    "5 % at random": draw_loss(0.05),
+    "20 % at random": draw_loss(0.2),
+    "10 % in bursts of 10": draw_loss(0.1, 10),
+    "10 % in bursts of 300": draw_loss(0.1, 300),
+}
 
 
 def make_mems_mix(k: float = 1.5e-6) -> NoiseModel:
@@ -219,6 +240,43 @@ def print_steps(repeats: int, seed: int) -> None:
     console.print(table)
 
 
+def print_loss(days: float, repeats: int, seed: int) -> None:
+    """Print delays at 100 Hz and false alarms at 10 Hz, if samples of the mix are missing on all axes."""
+    changes, step = make_changes(), WHITE * RATE_HZ**0.5
+    cases = {"N × 1.5": changes["N × 1.5"], "N × 1.2": changes["N × 1.2"]}
+    cases["step of 1 σ"] = (1200.0, 60.0, lambda values, _: values + step)
+    table = create_table(
+        f"MEMS mix: found of {repeats}, delay s (median, 90 %); alarms in {days:g} d",
+        "loss",
+        *cases,
+        "alarms at 1 a day",
+    )
+    cells: dict[str, list[str]] = {loss: [] for loss in LOSSES}
+    for before, after, change in cases.values():
+        results: dict[str, list[list[Change]]] = {loss: [] for loss in LOSSES}
+        cut = int(before * RATE_HZ) + 7  # not at the border of a block
+        for k in range(-(-repeats // 6)):
+            values = make_mems_mix().simulate(cut + int(after * RATE_HZ), RATE_HZ, seed + k)
+            values[cut:] = change(values[cut:], np.random.default_rng(seed + k))
+            for loss, lose in LOSSES.items():
+                kept = np.where(lose(len(values), np.random.default_rng(seed + k))[:, None], np.nan, values)
+                results[loss] += detect_first_changes(kept[:cut], kept[cut:])
+        for loss, found in results.items():
+            _, count, delay, *_ = format_row("", found, cut)
+            cells[loss].append(f"{count.split()[0]}: {delay}")
+    detectors = {loss: NoiseAndBiasChangeDetector(10.0, 1.0) for loss in LOSSES}
+    rng, draw = np.random.default_rng(seed), make_mems_mix().start_stream(10.0, seed).draw_next_samples
+    seen: Counter[str] = Counter()
+    for _ in range(int(days * 864_000 / BLOCK_SAMPLES)):
+        values = draw(BLOCK_SAMPLES)
+        for loss, lose in LOSSES.items():
+            detectors[loss].process_samples(np.where(lose(BLOCK_SAMPLES, rng)[:, None], np.nan, values))
+            seen[loss] += len(detectors[loss].take_changes())
+    for loss, texts in cells.items():
+        table.add_row(loss, *texts, f"{seen[loss]}")
+    console.print(table)
+
+
 def print_cost() -> None:
     """Print the processor time compared with AllanWindow, in blocks of 100 samples."""
     values = draw_white(RATE_HZ, 0)(100_000)
@@ -244,7 +302,7 @@ def print_cost() -> None:
 def main() -> None:
     """Run the requested parts, or all parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("parts", nargs="*", default=["rate", "false", "delays", "steps", "cost"])
+    parser.add_argument("parts", nargs="*", default=["rate", "false", "delays", "steps", "loss", "cost"])
     parser.add_argument("--years", type=float, default=0.3)
     parser.add_argument("--repeats", type=int, default=120)
     parser.add_argument("--seed", type=int, default=0)
@@ -255,6 +313,7 @@ def main() -> None:
         "false": lambda: print_false_alarms(arguments.years, arguments.seed),
         "delays": lambda: print_delays(arguments.repeats, arguments.seed),
         "steps": lambda: print_steps(arguments.repeats, arguments.seed),
+        "loss": lambda: print_loss(100.0 * arguments.years / 0.3, arguments.repeats, arguments.seed),
         "cost": print_cost,
     }
     for part in arguments.parts:

@@ -92,11 +92,11 @@ class TestCanLogs:
         assert found.t_s is not None
         assert abs(found.t_s[0] - T0_NS * 1e-9) < 1e-2
 
-    def test_missing_samples_leave_a_gap_and_a_note(self, tmp_path: Path) -> None:
+    def test_missing_samples_leave_a_gap(self, tmp_path: Path) -> None:
         path = tmp_path / "drive.blf"
         gap = slice(2000, 3000)  # five seconds
         found = load_recording(path, LoadingOptions(decoder=write_can_log(path, gap)))
-        assert found.notes == ("1,000 samples missing in 1 place.",)
+        assert found.notes == ()
         assert found.t_s is not None
         assert found.t_s[-1] - found.t_s[0] == pytest.approx((N - 1) / RATE_HZ, abs=0.02)
 
@@ -131,7 +131,7 @@ class TestCaptures:
         assert found.rate_hz is None
         assert found.notes == ()
 
-    def test_lost_damaged_and_repeated_frames_are_counted(self, tmp_path: Path) -> None:
+    def test_damaged_and_repeated_frames_are_counted(self, tmp_path: Path) -> None:
         path = tmp_path / "capture.raw"
         chunks = encode(VECTORNAV, tmp_path)
         damaged = bytearray(chunks[500].data)
@@ -139,11 +139,7 @@ class TestCaptures:
         chunks[500] = dataclasses.replace(chunks[500], data=bytes(damaged))
         kept = [*chunks[:1000], *chunks[3000:3500], chunks[3499], *chunks[3500:]]  # ten seconds are missing
         found = load_recording(path, LoadingOptions(decoder=write_capture(path, kept)))
-        assert found.notes == (
-            "2,001 samples missing in 2 places.",
-            "1 frame rejected.",
-            "1 repeated sample left out.",
-        )
+        assert found.notes == ("1 frame rejected.", "1 repeated sample left out.")
         assert found.t_s is not None
         t_s = np.delete(np.arange(N), [500, *range(1000, 3000)]) / RATE_HZ
         np.testing.assert_allclose(found.t_s, t_s, atol=1e-6)
@@ -159,7 +155,7 @@ class TestCaptures:
         found = load_recording(path, LoadingOptions(RATE_HZ, decoder=choice))
         assert found.t_s is not None
         np.testing.assert_allclose(found.t_s, np.delete(np.arange(N), range(1000, 1200)) / RATE_HZ, atol=1e-6)
-        assert found.notes == ("200 samples missing in 1 place.",)
+        assert found.notes == ()
         assert found.rate_hz == RATE_HZ
 
     def test_step_back_of_the_device_time_is_reported(self, tmp_path: Path) -> None:

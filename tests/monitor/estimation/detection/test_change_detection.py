@@ -7,7 +7,17 @@ from scipy.signal import lfilter
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from monitor.estimation.detection.change_detection import LEARN_S, NoiseAndBiasChangeDetector
-from monitor.estimation.detection.change_kernel import MIN_REFERENCE_TERMS, TICK_SAMPLES, F, N, S
+from monitor.estimation.detection.change_kernel import (
+    FOUND,
+    GAP_N,
+    GAP_S,
+    KIND,
+    MIN_REFERENCE_TERMS,
+    TICK_SAMPLES,
+    F,
+    N,
+    S,
+)
 from monitor.estimation.detection.changed_coefficient_identification import (
     HaarVariancesBeforeAfter,
     identify_changed_coefficients,
@@ -137,6 +147,37 @@ def test_loss_changes_neither_the_variances_nor_their_scatter(loss, walk):
     assert (lossy[:, :, N] > 0.35 * whole[:, :, N]).all()
     error = np.sqrt(2.0 / lossy[:, :, N].sum(axis=0))
     assert (np.abs(variance[1] / variance[0] - 1.0) < 3.0 * error + 0.002).all()
+
+
+@pytest.mark.parametrize(("loss", "seed"), [(0.0, 3), (0.0, 4), (0.2, 3), (0.2, 5)])
+def test_small_change_is_found_on_every_axis(loss, seed):
+    """Neither a suspicion during the learning time nor the change itself in the factor F delays the alarm."""
+    noise = SIGMA * np.random.default_rng(seed).standard_normal((44_000, 6))
+    noise[40_000:] *= 1.2
+    detector = NoiseAndBiasChangeDetector(100.0)
+    detector.process_samples(lose(noise, loss, seed))
+    alarms = [(change.axis, change.found) for change in detector.take_changes()]
+    alarms += [(axis, alarm[FOUND]) for axis, alarm in enumerate(detector._state.alarm) if alarm[KIND] > 0.0]
+    assert sorted(axis for axis, _ in alarms) == [0, 1, 2, 3, 4, 5]
+    assert max(found for _, found in alarms) < 40_000 + 2500
+
+
+def test_random_loss_of_a_fifth_leaves_three_quarters_of_the_differences_of_white_noise():
+    counts = []
+    for kept in (simulate_white_noise(40_000), lose(simulate_white_noise(40_000), 0.2)):
+        detector = NoiseAndBiasChangeDetector(100.0)
+        detector.process_samples(kept)
+        counts.append(detector._state.band[:, 0, N])
+    assert (counts[1] > 0.74 * counts[0]).all()
+
+
+def test_differences_across_a_missing_sample_are_not_used_beside_a_line():
+    values = simulate_white_noise(40_000) + 5.0 * SIGMA * np.cos(0.9 * np.pi * np.arange(40_000))[:, None]
+    detector = NoiseAndBiasChangeDetector(100.0)
+    detector.process_samples(lose(values, 0.2))
+    one = detector._state.band[:, 0]
+    assert (one[:, GAP_S] / one[:, GAP_N] < 0.5 * one[:, S] / one[:, N]).all()
+    assert (np.abs(one[:, S] / one[:, N] / (SIGMA**2 * (1.0 + 25.0 * np.sin(0.45 * np.pi) ** 2)) - 1.0) < 0.03).all()
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.2])
