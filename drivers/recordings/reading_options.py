@@ -44,10 +44,12 @@ class ReadingOptions(SettingsModel):
     gyro_unit: Annotated[str, checked_by(units.angular_rate_factor)] | None = Field(
         None,
         examples=["deg/s"],
-        description="unit of gx gy gz in the file; absent: unit that the file states, or rad/s",
+        description="unit of gx gy gz in the file; absent: unit that the file states or its numbers show, or rad/s",
     )
     accel_unit: Annotated[str, checked_by(units.acceleration_factor)] | None = Field(
-        None, examples=["g"], description="unit of ax ay az in the file; absent: unit that the file states, or m/s²"
+        None,
+        examples=["g"],
+        description="unit of ax ay az in the file; absent: unit that the file states or its numbers show, or m/s²",
     )
     temperature_unit: Annotated[str, checked_by(units.temperature_factor_and_offset)] | None = Field(
         None,
@@ -55,8 +57,11 @@ class ReadingOptions(SettingsModel):
         description="unit of the temperature in the file; absent: unit that the file states, or °C",
     )
     time_unit: Annotated[str, checked_by(units.time_factor)] | None = Field(
-        None, examples=["ns"], description="unit of t in the file; absent: unit that the file states, or s"
+        None,
+        examples=["ns"],
+        description="unit of t in the file; absent: unit that the file states or its numbers show, or s",
     )
+    assume: bool = Field(False, description="use the likeliest unit if the units of a table are doubtful")
 
 
 OPTION_NAMES: Final = {key: f"--{key.replace('_', '-')}" for key in ReadingOptions.model_fields}

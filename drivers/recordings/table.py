@@ -57,6 +57,7 @@ class Table:
     fs: float | None  # sample rate in Hz; None if the file states no rate
     notes: list[str]
     units: Mapping[str, str] = field(default_factory=dict)  # units that the file states
+    names: Mapping[str, str] = field(default_factory=dict)  # column name of each quantity whose unit may be inferred
 
 
 def column_dtype(name: str) -> np.dtype[Any]:

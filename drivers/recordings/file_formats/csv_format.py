@@ -146,7 +146,7 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
     if not len(rows):
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
-    return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units)
+    return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units, layout.names)
 
 
 def _count_rows(source: CsvSource) -> int:
