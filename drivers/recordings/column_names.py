@@ -182,6 +182,8 @@ ASSUMED_UNITS: Final = {"gyro adc": "deg/s", "acc smooth": "g/2048"}
 UNSCALED: Final = frozenset(("raw", "lsb", "adc", "digits", "ticks"))
 """Words for numbers of which the column name does not state the scale."""
 _BRACKETED: Final = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]*[^\W\d_°][^\[\]()]*?|°)\s*[\])]\s*$")
+_CODE: Final = re.compile("0?x[0-9a-fA-F]+")
+"""Number of a message field in brackets, as MicroStrain writes it."""
 _AFTER_COMMA: Final = re.compile(r"^(.*\w)\s*,\s*([^,]*/[^,]*|m?g)\s*$")
 _INDEX: Final = re.compile(r"\[([012])\]")
 _WORDS: Final = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])|\d+|²")
@@ -232,7 +234,9 @@ def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
 def split_unit(name: str) -> tuple[str, str | None]:
     """Split ``gyro x [deg/s]`` into name and unit. The unit is None if the name has no brackets with a unit."""
     found = _BRACKETED.match(name) or _AFTER_COMMA.match(name)
-    return (found[1], found[2]) if found else (name, None)
+    if found is None:
+        return name, None
+    return found[1], None if _CODE.fullmatch(found[2]) else found[2]
 
 
 def find_ending_unit(name: str, kind: QuantityKind) -> str | None:

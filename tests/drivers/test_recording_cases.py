@@ -1,0 +1,99 @@
+"""Tables as other programs and boards write them: rates, units and samples are those of the sensor.
+
+Each file has the peculiarity of its source. Unless stated otherwise, each axis has white noise of 0.05 °/s and 0.01
+m/s² at 100 Hz, so the random walks are 0.300 °/√h and 0.0600 m/s/√h.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.data_types import times_to_seconds
+from drivers.errors import ConfigError
+from drivers.recordings import Recording, load_samples
+from drivers.units import DEGREE
+
+CASES = Path(__file__).parent / "recording_cases"
+ROWS = 400
+
+
+def random_walks(found: Recording) -> tuple[float, float, float]:
+    """Return the rate in Hz, and the random walks of the gyroscopes in °/√h and of the accelerometers in m/s/√h."""
+    assert found.times is not None
+    rate_hz = 1.0 / float(np.mean(np.diff(times_to_seconds(found.times))))
+    sigma = np.std(np.diff(found.values, axis=0), axis=0) / np.sqrt(2.0) / np.sqrt(rate_hz) * 60.0
+    return rate_hz, float(np.mean(sigma[:3])) / DEGREE, float(np.mean(sigma[3:]))
+
+
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "gyro", "accel", "said"),
+    [
+        ("time-in-ms", 100.0, 0.300, 0.060, "time in ms (100 Hz)"),
+        ("time-in-us", 100.0, 0.300, 0.060, "time in us (100 Hz)"),
+        ("time-iso8601", 100.0, 0.300, 0.060, ""),
+        ("unit-in-column-name", 100.0, 0.060, 0.060, ""),
+        ("unit-row", 100.0, 0.300, 0.060, "The line after the header states the units."),
+        ("trailing-tab", 100.0, 0.300, np.nan, ""),
+        ("preamble", 100.0, 0.300, 0.060, "accelerometer in g"),
+        ("boot-text", 100.0, 0.300, 0.060, "gyro in deg/s"),
+        ("degs-as-rads", 104.0, 0.130, 0.0345, "gyro in deg/s"),  # 0.55 rad/s would turn gravity, which stands still
+        ("gyro-only-zero-accel", 100.0, 0.300, 0.0, ""),
+    ],
+)
+def test_case(name: str, rate_hz: float, gyro: float, accel: float, said: str) -> None:
+    found = load_samples(CASES / f"{name}.csv")
+    assert random_walks(found) == pytest.approx((rate_hz, gyro, accel), rel=0.1, nan_ok=True)
+    assert said in " ".join(found.notes)
+    assert not any("not samples" in note for note in found.notes)
+
+
+def table(
+    header: str = "t,gx_dps,gy_dps,gz_dps", separator: str = ",", times: list[str] | None = None, end: str = ""
+) -> str:
+    """Return a table with the noise of the cases, and lines that end with ``end``."""
+    rates = np.random.default_rng(1).normal(size=(ROWS, 3)) * 0.05
+    listed = times or [f"{i / 100.0:.2f}" for i in range(ROWS)]
+    rows = [[time, *(f"{rate:.5f}" for rate in row)] for time, row in zip(listed, rates, strict=True)]
+    return "".join(f"{separator.join(row)}{end}\n" for row in [header.split(","), *rows])
+
+
+CLOCK = [f"{(23 * 3600 + 59 * 60 + 58 + i // 100) % 86_400 // 3600:02}:{(59 + (58 + i // 100) // 60) % 60:02}:"
+         f"{(58 + i // 100) % 60:02}.{i % 100 * 10:03}" for i in range(ROWS)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        (table(end=","), "utf-8"),
+        (table(separator="\t", end="\t"), "utf-8"),
+        (table(separator=";", end=";"), "utf-8"),
+        ("// start\n// range 250 dps\n" + table(), "utf-8"),
+        ("; made by a logger\n;\n" + table(separator=";"), "utf-8"),
+        ("! gain 4\n* bench\n-- x --\n" + table(), "utf-8"),
+        ("Logger 3.1\nrate,100,Hz\nrange,250,dps\n\n" + table(), "utf-8"),
+        ("% gyro of the left arm\n" + table(), "utf-8"),
+        ("sep=,\n" + table(), "utf-8-sig"),
+        (table(), "utf-16"),
+        (table("t,gx,gy,gz\ns,deg/s,deg/s,deg/s").replace("\ns,", "\ns,"), "utf-8"),
+        (table("Time (s),X Gyro [dps],Y Gyro [dps],Z Gyro [dps]"), "utf-8"),
+        (table("Time,gx_dps,gy_dps,gz_dps", times=CLOCK), "utf-8"),
+        (table("Timestamp,gx_dps,gy_dps,gz_dps", times=[f"01/03/2024 {one}" for one in CLOCK]), "utf-8"),
+        (table("date,time,gx_dps,gy_dps,gz_dps", times=[f"2024-03-01,{one}" for one in CLOCK]), "utf-8"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".log", ".dat", ".gcsv"])
+def test_text_layouts(tmp_path: Path, text: str, encoding: str, suffix: str) -> None:
+    if suffix != ".csv" and encoding == "utf-16":
+        return
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(text.encode(encoding))
+    found = load_samples(path)
+    assert len(found) == ROWS
+    assert random_walks(found)[:2] == pytest.approx((100.0, 0.300), rel=0.1)
+
+
+def test_an_unknown_unit_in_the_row_of_units(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text(table("t,gx,gy,gz\ns,furlong,deg/s,deg/s"))
+    with pytest.raises(ConfigError, match='column of gx: "furlong" is not a unit of angular rate'):
+        load_samples(tmp_path / "x.csv")
