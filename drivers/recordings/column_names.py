@@ -177,6 +177,8 @@ _OTHER_QUANTITIES: Final = frozenset(
     )
 )  # fmt: skip
 """Words of columns that do not contain the samples of a sensor."""
+STANDARD_UNITS: Final = {"w rs s": "rad/s", "a rs s": "m/s²"}
+"""Units of columns whose format always has these units."""
 ASSUMED_UNITS: Final = {"gyro adc": "deg/s", "acc smooth": "g/2048"}
 """Units of columns that never state their unit."""
 UNSCALED: Final = frozenset(("raw", "lsb", "adc", "digits", "ticks"))
@@ -187,6 +189,15 @@ _CODE: Final = re.compile("0?x[0-9a-fA-F]+")
 _AFTER_COMMA: Final = re.compile(r"^(.*\w)\s*,\s*([^,]*/[^,]*|m?g)\s*$")
 _INDEX: Final = re.compile(r"\[([012])\]")
 _WORDS: Final = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])|\d+|²")
+
+
+SENSOR_COLUMNS: Final = frozenset(
+    (
+        "I", "id", "imu", "imu id", "sensor", "sensor id", "instance", "device", "device id", "dev", "node", "bus",
+        "channel", "chan", "unit", "addr", "address", "source", "src", "imu no", "sensor no",
+    )
+)  # fmt: skip
+"""Names of columns that tell the rows of several sensors apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +240,11 @@ def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
     if found is None or unit is None:
         return found
     return ColumnName(found.quantity, found.rank, unit, found.assumed, found.sensor)
+
+
+def names_sensor(name: str) -> bool:
+    """Return True if a column with this name tells the rows of several sensors apart."""
+    return name == "I" or " ".join(_split_words(name)) in SENSOR_COLUMNS
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
@@ -328,6 +344,7 @@ def _describe_axis(
     inner_unit = next((word for word in inner if word in spellings), None)
     if unit is None and inner_unit is not None:  # accG X
         unit, inner = spellings[inner_unit], [word for word in inner if word != inner_unit]
+    unit = unit or STANDARD_UNITS.get(phrase)
     others = [word for word in ending[:at] if word not in _DESCRIPTIONS]
     if unit is None and phrase not in ASSUMED_UNITS:
         unit = next((word for word in (*others, *inner) if word in UNSCALED - {"raw"}), None)

@@ -42,8 +42,6 @@ def _table_format(read: Callable[[Path, ReadingOptions], Table], open_writer: Op
     """Return the format of a file that contains a single table and no topics."""
 
     def read_table(path: Path, options: ReadingOptions) -> Table:
-        if options.topic is not None:
-            raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {options.topic}")
         return convert_to_si(path, read(path, options), options)
 
     return Format(read_table, open_writer, any_columns=True)

@@ -33,7 +33,8 @@ class ReadingOptions(SettingsModel):
     topic: str | None = Field(
         None,
         examples=["/imu/data"],
-        description="topic of a ROS bag or an autopilot log; absent: the only topic with IMU data",
+        description="topic of a ROS bag or an autopilot log, or one of several sensors of a table; absent: the only "
+        "one with IMU data",
     )
     columns: dict[Annotated[str, one_of(COLUMNS)], Annotated[str, BeforeValidator(_to_column_reference)]] = Field(
         {},

@@ -17,6 +17,9 @@ from drivers.recordings import memory_check
 COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the columns that the readers recognize."""
 
+SENSOR: Final = "sensor"
+"""Column that tells the rows of several sensors apart, if a table has one."""
+
 TIME_NS: Final = "t_ns"
 """Column of the times in ns as int64. It replaces ``t`` if the source contains times in whole ns, µs or ms, because
 float64 would round Unix times to 0.24 µs."""
@@ -58,6 +61,7 @@ class Table:
     notes: list[str]
     units: Mapping[str, str] = field(default_factory=dict)  # units that the file states
     names: Mapping[str, str] = field(default_factory=dict)  # column name of each quantity whose unit may be inferred
+    sensors: Sequence[str] = ()  # name of the sensor for each number in SENSOR; empty if the numbers are names
 
 
 def column_dtype(name: str) -> np.dtype[Any]:

@@ -6,7 +6,7 @@ in this order. The same rules apply to all tables: CSV, .npz, Parquet, Arrow and
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, cast
 
@@ -20,6 +20,7 @@ from drivers.recordings.column_names import (
     UNSCALED,
     ColumnName,
     find_ending_unit,
+    names_sensor,
     parse_column_name,
     split_unit,
 )
@@ -27,6 +28,7 @@ from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table import (
     COLUMNS,
     NO_TIME_NS,
+    SENSOR,
     TIME_NS,
     Table,
     check_column_count,
@@ -34,6 +36,7 @@ from drivers.recordings.table import (
     format_name_list,
     integers_to_ns,
 )
+from drivers.recordings.topic_selection import HOW_TO_CHOOSE
 from drivers.recordings.unit_inference import infer_units
 from drivers.validation.module_lookup import format_suggestion
 
@@ -42,6 +45,13 @@ BETAFLIGHT_NOTE: Final = (
     "blackbox_high_resolution, give --gyro-unit deg/s/10. For another acc_1G than 2048 in the header of the log, give "
     "--accel-unit g/acc_1G, such as g/4096."
 )
+
+MAX_SENSORS: Final = 32
+"""Number of different values up to which a column can tell the rows of several sensors apart."""
+
+MIN_INTERLEAVED_ROWS: Final = 240
+MIN_SEPARATION: Final = 5.0
+"""Ratio of the difference of two means to the standard deviation from which alternating rows belong to two sensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +103,8 @@ def find_layout(
     }
     _check_used_once(path, names, chosen)
     meanings = {i: meaning for i, name in enumerate(names) if (meaning := parse_column_name(name, sensor)) is not None}
+    sensor_column = next((i for i, name in enumerate(names) if names_sensor(name) and i not in chosen.values()), None)
+    meanings = _select_named_sensor(path, meanings, options, sensor_column is not None)
     for quantity in COLUMNS:
         if quantity not in options.columns:
             free = {i: one for i, one in meanings.items() if one.quantity == quantity and i not in chosen.values()}
@@ -104,11 +116,13 @@ def find_layout(
             f"{' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
             f"{describe_suffix_mismatch(path)}"
         )
+    if sensor_column is not None:
+        chosen[SENSOR] = sensor_column
     others = [name for i, name in enumerate(names) if i not in chosen.values() and name not in ("", "fs")]
     if others:
         notes.append(f"Other columns are not used: {format_name_list(others)}.")
     return TableLayout(
-        {quantity: chosen[quantity] for quantity in COLUMNS if quantity in chosen},
+        {quantity: chosen[quantity] for quantity in (*COLUMNS, SENSOR) if quantity in chosen},
         _stated_units(names, chosen, meanings, options, notes),
         {quantity: quantity if sensor and names[i] in ("x", "y", "z") else names[i] for quantity, i in chosen.items()},
     )
@@ -127,6 +141,9 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
     """
     notes = list(table.notes)
     stated = table.units
+    table = _select_rows_of_sensor(path, table, options)
+    if table.names:
+        _check_interleaving(path, table.columns)
     table = _infer_units(path, table, options, notes)
     columns = {}
     for quantity, column in table.columns.items():
@@ -142,6 +159,87 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
         if given is not None and contradicted:
             notes.append(f"The file states {', '.join(contradicted)}; the requested {given} is used.")
     return Table(columns, table.fs, notes, table.units)
+
+
+def _select_named_sensor(
+    path: Path, meanings: Mapping[int, ColumnName], options: ReadingOptions, has_sensor_column: bool
+) -> dict[int, ColumnName]:
+    """Return the columns of one of several sensors whose names are part of the column names, such as ``imu2_gyro_x``.
+
+    Raises
+    ------
+    ConfigError
+        If the user must choose a sensor, or if the chosen sensor does not exist.
+    """
+    axes = {i: one for i, one in meanings.items() if one.quantity in AXES and one.quantity not in options.columns}
+    sensors = sorted({one.sensor for one in axes.values()} - {""})
+    topic = options.topic
+    if topic in sensors:
+        return {i: one for i, one in meanings.items() if i not in axes or one.sensor == topic}
+    if topic is not None and not has_sensor_column:
+        if sensors:
+            raise ConfigError(f'{path}: has no sensor "{topic}"; it has {", ".join(sensors)}')
+        raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {topic}")
+    unnamed = {one.quantity for one in axes.values() if not one.sensor}
+    counts = Counter(one.quantity for one in axes.values() if one.sensor and one.quantity not in unnamed)
+    if len(sensors) > 1 and counts and max(counts.values()) > 1:
+        of_sensor = {sensor: [one.quantity for one in axes.values() if one.sensor == sensor] for sensor in sensors}
+        listed = "; ".join(f"{sensor} ({' '.join(quantities)})" for sensor, quantities in of_sensor.items())
+        raise ConfigError(
+            f"{path}: contains the columns of {len(sensors)} sensors: {listed}; {HOW_TO_CHOOSE}, such as {sensors[0]}"
+        )
+    return dict(meanings)
+
+
+def _select_rows_of_sensor(path: Path, table: Table, options: ReadingOptions) -> Table:
+    """Return the rows of one sensor of a table with a column that tells the rows of several sensors apart.
+
+    Raises
+    ------
+    ConfigError
+        If the user must choose a sensor, or if the chosen sensor does not exist.
+    """
+    columns = dict(table.columns)
+    codes = columns.pop(SENSOR, None)
+    if codes is None:
+        return table
+    found, counts = np.unique(codes[np.isfinite(codes)], return_counts=True)
+    rest = Table(columns, table.fs, table.notes, table.units, {q: n for q, n in table.names.items() if q != SENSOR})
+    if not 1 < found.size <= MAX_SENSORS:  # a single sensor, or a counter
+        return rest
+    column = table.names[SENSOR]
+    values = [table.sensors[int(code)] if table.sensors else f"{code:g}" for code in found]
+    topics = [f"{column}={value}" for value in values]
+    if options.topic is None:
+        listed = ", ".join(f"{topic} ({count} rows)" for topic, count in zip(topics, counts.tolist(), strict=True))
+        raise ConfigError(
+            f"{path}: contains the rows of {found.size} sensors: {listed}; {HOW_TO_CHOOSE}, such as {topics[0]}"
+        )
+    match = [code for code, *known in zip(found, topics, values, strict=True) if options.topic in known]
+    if not match:
+        raise ConfigError(f'{path}: has no rows of "{options.topic}"; it has {", ".join(topics)}')
+    rows = codes == match[0]
+    return replace(rest, columns={quantity: values[rows] for quantity, values in columns.items()})
+
+
+def _check_interleaving(path: Path, columns: Mapping[str, Times]) -> None:
+    """Raise RecordingError if the rows of several sensors alternate without a column that tells them apart.
+
+    The values of every k-th row then agree with each other, and differ from those of the other rows.
+    """
+    for axis in AXES:
+        column = columns.get(axis)
+        if column is None or column.size < 2 * MIN_INTERLEAVED_ROWS:
+            continue
+        for sensors in (2, 3, 4):
+            starts = (0, (column.size - MIN_INTERLEAVED_ROWS) // 2, column.size - MIN_INTERLEAVED_ROWS)
+            parts = [column[at : at + MIN_INTERLEAVED_ROWS].reshape(-1, sensors) for at in starts]
+            if all(np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() > 0.0 for part in parts):
+                raise RecordingError(
+                    f"{path}: every {['second', 'third', 'fourth'][sensors - 2]} row of {axis} agrees, and the others "
+                    f"differ: the rows of {sensors} sensors alternate; add a column that names the sensor, such as "
+                    "imu, or write one file for each sensor"
+                )
 
 
 def _find_conversion(path: Path, quantity: str, unit: str) -> tuple[float, float]:
@@ -242,6 +340,8 @@ def _select_candidate(path: Path, names: Sequence[str], quantity: str, candidate
     """Return the column with the lowest rank. Raise RecordingError if several columns have this rank."""
     lowest = min(one.rank for one in candidates.values())
     best = [i for i, one in candidates.items() if one.rank == lowest]
+    if quantity == "t" and len(stated := [i for i in best if candidates[i].unit is not None]) == 1:
+        best = stated
     if len({names[i] for i in best}) < len(best):
         raise RecordingError(f"{path}: column {names[best[0]]} occurs twice; each may occur once")
     if len(best) > 1:
@@ -269,6 +369,8 @@ def _stated_units(
     found = {}
     assumes = False
     for quantity, i in chosen.items():
+        if quantity == SENSOR:
+            continue
         kind, meaning = KIND_OF[quantity], meanings.get(i)
         if meaning is None or KIND_OF[meaning.quantity] is not kind:
             meaning = ColumnName(quantity, 0, find_ending_unit(names[i], kind))

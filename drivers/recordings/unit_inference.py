@@ -76,6 +76,7 @@ class _Evidence:
     gravity: float | None  # magnitude of the specific force
     gravity_sigma: float  # uncertainty of its logarithm
     accel_noise: float | None
+    temperature_step_c: float  # mean change of the temperature between two samples; 0 if it is not measured
     rotation: float | None  # angle in rad per unit of angular rate and sample, from the direction of gravity
 
 
@@ -168,7 +169,7 @@ def _collect_evidence(columns: Mapping[str, Times], blocks: Sequence[slice], rat
         _smallest_noise(gyro, quiet) if at_rest else None, bias,
         0.0 if gyro is None else float(np.nanmax(np.abs(gyro), initial=0.0)),
         gravity, gravity_sigma, _smallest_noise(accel, quiet) if at_rest else None,
-        _measure_rotation(gyro, accel),
+        _measure_warming(columns.get("temperature")), _measure_rotation(gyro, accel),
     )  # fmt: skip
 
 
@@ -214,6 +215,17 @@ def _measure_steps(times: Times | None, blocks: Sequence[slice]) -> tuple[float 
     return step or None, first, bool(np.all(steps == steps[0]))
 
 
+def _measure_warming(temperature: Times | None, parts: int = 8) -> float:
+    """Return the largest mean change of the temperature per sample between parts of the recording."""
+    if temperature is None or temperature.size < parts * MIN_SAMPLES // 2:
+        return 0.0
+    size = temperature.size // parts
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a part may contain no values
+        means = np.nanmedian(temperature[: parts * size].reshape(parts, size), axis=1)
+        return float(np.nanmax(np.abs(np.diff(means)), initial=0.0)) / size
+
+
 def _measure_rotation(gyro: Floats | None, accel: Floats | None, rows: int = 32) -> float | None:
     """Return the angle in rad per unit of angular rate and sample, or None if the sensor turns too little.
 
@@ -257,9 +269,10 @@ def _list_candidates(
     fractional = any(bool(np.any(np.mod(part[np.isfinite(part)], 1.0) != 0.0)) for part in parts)
     if kind == TIME.name:
         found = dict.fromkeys(TIME_UNITS if evidence.step else ["s"], 0.0)
-        found["s"] = 2.0 * OWN_NAME if own and parts[0].dtype.kind == "f" else 3.0 if fractional else 0.0
+        own_s = OWN_TIME if parts[0].dtype.kind == "f" else 6.0
+        found["s"] = own_s if own else 3.0 if fractional else 0.0
         if evidence.constant_step and evidence.step == 1.0:
-            found[ROW_NUMBER] = 0.0 if evidence.first_time in (0.0, 1.0) else -6.0
+            found[ROW_NUMBER] = 0.0 if evidence.first_time in (0.0, 1.0) and not own else -6.0
         return found
     counts = any(stated.get(q, "").lower() in UNSCALED for q in members)
     largest = max(float(np.nanmax(np.abs(part), initial=0.0)) for part in parts)
@@ -292,10 +305,9 @@ def _score(candidates: Mapping[str, Mapping[str, float]], evidence: _Evidence) -
     of_gyro = {unit: _score_gyro(unit, evidence) for unit in candidates[GYRO.name]}
     of_accel = {unit: _score_accel(unit, evidence) for unit in candidates[ACCEL.name]}
     scores = {}
-    for combination in itertools.product(*(candidates[kind.name] for kind in (TIME, GYRO, ACCEL))):
-        time, gyro, accel = combination
+    for time, gyro, accel in itertools.product(*(candidates[kind.name] for kind in (TIME, GYRO, ACCEL))):
         rate_hz = _rate(time, evidence)
-        score = sum(candidates[kind.name][unit] for kind, unit in zip((TIME, GYRO, ACCEL), combination, strict=True))
+        score = candidates[TIME.name][time] + candidates[GYRO.name][gyro] + candidates[ACCEL.name][accel]
         score += of_gyro[gyro] + of_accel[accel] + _score_time(time, rate_hz, evidence)
         if gyro and accel:
             in_g, in_degrees = "g" in accel, not gyro.endswith("rad/s")
@@ -306,7 +318,7 @@ def _score(candidates: Mapping[str, Mapping[str, float]], evidence: _Evidence) -
             score += 0.5 * _score_noise(evidence.accel_noise * acceleration_factor(accel), rate_hz, 1.5e-3, 0.1)
         if gyro and evidence.rotation is not None and rate_hz is not None:
             score += _normal(log(evidence.rotation * rate_hz / angular_rate_factor(gyro)), 0.3, 14.0)
-        scores[combination] = score
+        scores[time, gyro, accel] = score
     return scores
 
 
@@ -334,7 +346,8 @@ def _score_time(unit: str, rate_hz: float | None, evidence: _Evidence) -> float:
         np.interp(decades, (-3, -1, 0, 1, 1.4, 3.3, 4, 4.5, 5, 7), (-20, -9, -5, -0.5, 0, 0, -3, -5, -10, -20))
     )
     unix_s = evidence.first_time * time_factor(unit or "s")
-    return score + (4.0 if 9.5e8 < unix_s < 2.1e9 else 0.0)
+    warming_c_s = evidence.temperature_step_c * rate_hz
+    return score + (4.0 if 9.5e8 < unix_s < 2.1e9 else 0.0) - 8.0 * _beyond(warming_c_s, 0.5, 5.0)
 
 
 def _score_gyro(unit: str, evidence: _Evidence) -> float:

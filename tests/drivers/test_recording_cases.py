@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from drivers.data_types import times_to_seconds
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import Recording, load_samples
+from drivers.recordings.reading_options import ReadingOptions
 from drivers.units import DEGREE
 
 CASES = Path(__file__).parent / "recording_cases"
@@ -96,4 +97,54 @@ def test_text_layouts(tmp_path: Path, text: str, encoding: str, suffix: str) -> 
 def test_an_unknown_unit_in_the_row_of_units(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text(table("t,gx,gy,gz\ns,furlong,deg/s,deg/s"))
     with pytest.raises(ConfigError, match='column of gx: "furlong" is not a unit of angular rate'):
+        load_samples(tmp_path / "x.csv")
+
+
+def test_rows_of_three_sensors() -> None:
+    path = CASES / "three-imus-in-rows.csv"
+    with pytest.raises(ConfigError, match=r"3 sensors: I=0 \(403 rows\), I=1 .*; choose with --topic .*, such as I=0"):
+        load_samples(path)
+    for topic in ("I=1", "1"):
+        found = load_samples(path, options=ReadingOptions(topic=topic))
+        assert len(found) == 403
+        assert random_walks(found) == pytest.approx((100.0, 0.300, 0.060), rel=0.1)
+        assert found.values[:, 0].mean() == pytest.approx(0.018, abs=0.002)
+    with pytest.raises(ConfigError, match=r'no rows of "7"; it has I=0, I=1, I=2'):
+        load_samples(path, options=ReadingOptions(topic="7"))
+
+
+def test_rows_of_two_sensors_with_names(tmp_path: Path) -> None:
+    lines = table(times=[f"{i // 2 / 100.0:.2f}" for i in range(ROWS)]).splitlines()
+    rows = [f"{line},{['left', 'right'][i % 2]}" for i, line in enumerate(lines[1:])]
+    (tmp_path / "x.csv").write_text("\n".join([f"{lines[0]},imu_id", *rows]) + "\n")
+    with pytest.raises(ConfigError, match=r"imu_id=left \(200 rows\), imu_id=right \(200 rows\)"):
+        load_samples(tmp_path / "x.csv")
+    found = load_samples(tmp_path / "x.csv", options=ReadingOptions(topic="right"))
+    assert random_walks(found)[:2] == pytest.approx((100.0, 0.300), rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "topic"),
+    [("imu0_gyro_{}_dps", "imu1_gyro_{}_dps", "imu1"), ("left gyro {} (dps)", "right gyro {} (dps)", "right"),
+     ("gyro1_{} [dps]", "gyro2_{} [dps]", "2")],
+)  # fmt: skip
+def test_columns_of_two_sensors(tmp_path: Path, first: str, second: str, topic: str) -> None:
+    rates = np.random.default_rng(2).normal(size=(ROWS, 6)) * 0.05 + np.repeat([0.0, 1.0], 3)
+    header = ",".join(["t", *(pattern.format(axis) for pattern in (first, second) for axis in "xyz")])
+    rows = np.c_[np.arange(ROWS) / 100.0, rates]
+    np.savetxt(tmp_path / "x.csv", rows, "%.6f", ",", header=header, comments="")
+    with pytest.raises(ConfigError, match=rf"the columns of 2 sensors: .*{topic} \(gx gy gz\); choose with --topic"):
+        load_samples(tmp_path / "x.csv")
+    found = load_samples(tmp_path / "x.csv", options=ReadingOptions(topic=topic))
+    assert found.values[:, :3].mean() == pytest.approx(DEGREE, rel=0.05)
+
+
+@pytest.mark.parametrize("sensors", [2, 3])
+def test_alternating_rows_without_a_name(tmp_path: Path, sensors: int) -> None:
+    rates = np.random.default_rng(2).normal(size=(2000, 3)) * 0.001
+    rates[::sensors, 1] += 0.01
+    rows = enumerate(rates.tolist())
+    text = "".join(f"{i // sensors * 0.01:.2f},{x:.6f},{y:.6f},{z:.6f}\n" for i, (x, y, z) in rows)
+    (tmp_path / "x.csv").write_text(f"t,gx,gy,gz\n{text}")
+    with pytest.raises(RecordingError, match=f"the rows of {sensors} sensors alternate"):
         load_samples(tmp_path / "x.csv")

@@ -64,6 +64,8 @@ GZIP_LEVEL: Final = 1
 
 Rows = NDArray[np.void]
 """Structured array [lines] with a field for each quantity."""
+_Converters = dict[int, Callable[[str], float]]
+"""For the index of each column that contains text: function that returns the number of a field."""
 
 
 class _FractionalTimeError(Exception):
@@ -135,14 +137,19 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
         if header.has_units:
             notes.append("The line after the header states the units.")
         text_time = _find_text_time(header, layout)
+        converters: _Converters = {}
         if text_time:
             time_type = "i8"
             layout.units["t"] = "ns"
+            converters[layout.columns["t"]] = parse_text_time
+        sensors: dict[str, int] = {}
+        if table.SENSOR in layout.columns:
+            converters[layout.columns[table.SENSOR]] = lambda field: sensors.setdefault(field.strip(' "'), len(sensors))
         use = list(layout.columns.values())
         dtype = np.dtype([(name, time_type if name == "t" else "f8") for name in layout.columns])
         parts: list[Rows] = []
         read = 0
-        for part in _parse_pieces(label, header, texts, use, dtype, bad, layout.columns["t"] if text_time else None):
+        for part in _parse_pieces(label, header, texts, use, dtype, bad, converters):
             parts.append(part)
             read += len(part)
             report_read_share(read, lines)
@@ -157,7 +164,7 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
     columns = {name: rows[name] for name in layout.columns}
     if text_time and not has_date(text_time):
         columns["t"] = unwrap_days(columns["t"])
-    return table.Table(columns, None, notes, layout.units, layout.names)
+    return table.Table(columns, None, notes, layout.units, layout.names, tuple(sensors))
 
 
 def _find_text_time(header: CsvHeader, layout: TableLayout) -> str:
@@ -259,17 +266,17 @@ def _parse_pieces(
     use: Sequence[int],
     dtype: np.dtype[Any],
     bad: _BadLines,
-    text_time: int | None,
+    converters: _Converters,
 ) -> Iterator[Rows]:
-    """Yield the rows of each piece of CSV text. ``text_time`` is the column of times that are text."""
+    """Yield the rows of each piece of CSV text. ``converters`` contains the columns that are text."""
     number, rows = header.rest_number, 0
     for text in chain((header.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
         if text.strip():
-            part = _parse_regular_lines(text, header, use, dtype, text_time)
+            part = _parse_regular_lines(text, header, use, dtype, converters)
             if part is None and (samples := NOT_SAMPLES.sub(b"", text)) != text and samples:
-                part = _parse_regular_lines(samples, header, use, dtype, text_time)
-            part = _parse_line_by_line(text, number, header, use, dtype, bad, text_time) if part is None else part
+                part = _parse_regular_lines(samples, header, use, dtype, converters)
+            part = _parse_line_by_line(text, number, header, use, dtype, bad, converters) if part is None else part
             rows += len(part)
             if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
                 raise _too_many_bad_lines(path, bad, rows)
@@ -278,7 +285,7 @@ def _parse_pieces(
 
 
 def _parse_regular_lines(
-    text: bytes, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], text_time: int | None
+    text: bytes, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], converters: _Converters
 ) -> Rows | None:
     """Return the rows of lines, or None if any line is irregular."""
     if header.separator in DECIMAL_COMMA_SEPARATORS and b"," in text:
@@ -301,7 +308,7 @@ def _parse_regular_lines(
             warnings.simplefilter("error", DeprecationWarning)  # some versions of NumPy read 1.5 as the integer 1
             return np.loadtxt(
                 lines, dtype, delimiter=header.separator or None, comments=None, usecols=use, ndmin=1,
-                converters=None if text_time is None else {text_time: parse_text_time},
+                converters=dict(converters) or None,
             )  # fmt: skip
     except (ValueError, DeprecationWarning):
         return None
@@ -314,7 +321,7 @@ def _parse_line_by_line(
     use: Sequence[int],
     dtype: np.dtype[Any],
     bad: _BadLines,
-    text_time: int | None,
+    converters: _Converters,
 ) -> Rows:
     """Return the rows of lines. Invalid lines become missing values. Comment lines are skipped."""
     missing = tuple(table.NO_TIME_NS if dtype[i].kind == "i" else np.nan for i in range(len(use)))
@@ -323,7 +330,7 @@ def _parse_line_by_line(
         if not line.strip() or line.lstrip().startswith(COMMENT_MARKS):
             continue
         try:
-            rows.append(_parse_sample(line, header, use, dtype, text_time))
+            rows.append(_parse_sample(line, header, use, dtype, converters))
         except ValueError as error:
             bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
@@ -331,15 +338,15 @@ def _parse_line_by_line(
 
 
 def _parse_sample(
-    line: str, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], text_time: int | None
+    line: str, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], converters: _Converters
 ) -> tuple[float, ...]:
     fields = split_fields(line, header.separator)
     if len(fields) != len(header.names):
         raise ValueError(f"{len(fields)} fields where the header has {len(header.names)}")
     row: list[float] = []
     for column, i in enumerate(use):
-        if i == text_time:
-            row.append(parse_text_time(fields[i]))
+        if i in converters:
+            row.append(converters[i](fields[i]))
             continue
         number = parse_number(fields[i], header.separator)
         if number is None:

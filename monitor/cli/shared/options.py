@@ -155,7 +155,8 @@ LENGTH_OPTIONS = {
 READING_OPTIONS = {
     "topic": _text_option(
         "NAME",
-        "Topic of a ROS bag or an autopilot log; by default the only topic with IMU data. A+B joins two topics.",
+        "Topic of a ROS bag or an autopilot log, or one of several sensors of a table; by default the only one with "
+        "IMU data. A+B joins two topics.",
     ),
     "columns": _text_option(
         "Q=COLUMN,…", "Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name."
