@@ -64,7 +64,7 @@ GZIP_LEVEL: Final = 1
 
 Rows = NDArray[np.void]
 """Structured array [lines] with a field for each quantity."""
-_Converters = dict[int, Callable[[str], float]]
+_Converters = dict[int | str, Callable[[str], Any]]
 """For the index of each column that contains text: function that returns the number of a field."""
 
 
@@ -308,7 +308,7 @@ def _parse_regular_lines(
             warnings.simplefilter("error", DeprecationWarning)  # some versions of NumPy read 1.5 as the integer 1
             return np.loadtxt(
                 lines, dtype, delimiter=header.separator or None, comments=None, usecols=use, ndmin=1,
-                converters=dict(converters) or None,
+                converters=converters or None,
             )  # fmt: skip
     except (ValueError, DeprecationWarning):
         return None
