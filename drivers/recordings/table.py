@@ -1,5 +1,6 @@
 """Types and functions that all recording formats share."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -132,6 +133,13 @@ CONTENTS: Final = (
 """For each type of file: the first bytes, the name of the type, and the suffixes of recordings of this type."""
 
 
+NO_RECORDINGS: Final = (
+    (re.compile(rb"version https://git-lfs"), "a pointer of Git LFS: fetch the file with `git lfs pull`"),
+    (re.compile(rb"\s*<(?:!doctype html|html)", re.IGNORECASE), "an HTML page: download the file itself"),
+)
+"""Start and description of files that were fetched in place of a recording, with the remedy."""
+
+
 def describe_suffix_mismatch(path: Path) -> str:
     """Return an error text about a file whose content does not match its suffix.
 
@@ -142,6 +150,9 @@ def describe_suffix_mismatch(path: Path) -> str:
             start = file.read(256)
     except OSError:
         return ""
+    for pattern, what in NO_RECORDINGS:
+        if pattern.match(start):
+            return f"; its content is {what}"
     for magic, what, suffixes in CONTENTS:
         if start.startswith(magic):
             if path.name.lower().endswith(suffixes or ("",)) and suffixes:

@@ -46,6 +46,8 @@ BETAFLIGHT_NOTE: Final = (
     "--accel-unit g/acc_1G, such as g/4096."
 )
 
+MAX_LISTED_NAMES: Final = 60
+"""Number of column names in the message about a table without axes. The needed names may be the last ones."""
 MAX_SENSORS: Final = 32
 """Number of different values up to which a column can tell the rows of several sensors apart."""
 
@@ -112,8 +114,8 @@ def find_layout(
                 chosen[quantity] = _select_candidate(path, names, quantity, free)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: no axis among its columns ({format_name_list(names)}){where}; a recording has some of "
-            f"{' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
+            f"{path}: no axis among its columns ({format_name_list(names, MAX_LISTED_NAMES)}){where}; a recording "
+            f"has some of {' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
             f"{describe_suffix_mismatch(path)}"
         )
     if sensor_column is not None:

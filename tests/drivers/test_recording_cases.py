@@ -4,6 +4,7 @@ Each file has the peculiarity of its source. Unless stated otherwise, each axis 
 m/s² at 100 Hz, so the random walks are 0.300 °/√h and 0.0600 m/s/√h.
 """
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -148,3 +149,31 @@ def test_alternating_rows_without_a_name(tmp_path: Path, sensors: int) -> None:
     (tmp_path / "x.csv").write_text(f"t,gx,gy,gz\n{text}")
     with pytest.raises(RecordingError, match=f"the rows of {sensors} sensors alternate"):
         load_samples(tmp_path / "x.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", "a pointer of Git LFS: fetch .* `git lfs"),
+        ("\n<!DOCTYPE html>\n<html>\n<body>\n", "an HTML page: download the file itself"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".bag", ".ulg"])
+def test_a_file_in_place_of_a_recording(tmp_path: Path, text: str, expected: str, suffix: str) -> None:
+    (tmp_path / f"x{suffix}").write_text(text)
+    with pytest.raises(RecordingError, match=expected):
+        load_samples(tmp_path / f"x{suffix}")
+
+
+def test_needed_columns_are_not_hidden(tmp_path: Path) -> None:
+    names = [f"flag_{i}" for i in range(40)] + ["p", "q", "r"]
+    (tmp_path / "x.csv").write_text(",".join(names) + "\n" + ",".join("1" * len(names)) + "\n")
+    with pytest.raises(RecordingError, match=r"flag_39, p, q, r\)"):
+        load_samples(tmp_path / "x.csv")
+
+
+def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
+    head = struct.pack("<BQI4sI", 1, 12, 4, b"ros1", 0)
+    (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + head + bytes(100) + b"\x89MCAP0\r\n")
+    with pytest.raises(RecordingError, match=r"contains messages of ROS 1 in MCAP, .* read the bag \(.bag\)"):
+        load_samples(tmp_path / "x.mcap")
