@@ -13,6 +13,7 @@ from drivers.errors import ConfigError, ImuError, NotReady
 
 ARGUMENTS: Final = {
     "--accel-unit": "accel_unit",
+    "--assume": "assume=True",
     "--columns": "columns",
     "--correlation-time S": "correlation_time_s",
     "--gyro-unit": "gyro_unit",

@@ -157,6 +157,7 @@ def read_recording(
     accel_unit: str | None = None,
     temperature_unit: str | None = None,
     time_unit: str | None = None,
+    assume: bool = False,
 ) -> Recording:
     """Read a recording from a file, or from all segments in a folder.
 
@@ -175,13 +176,18 @@ def read_recording(
         Column of a table for each quantity (``t``, ``gx``, …, ``temperature``): a name, a number from 1, or ``"-"`` to
         leave the quantity out. By default, the columns are recognized by their names.
     gyro_unit : str, optional
-        Unit of the angular rates in the file, such as ``"deg/s"``. By default, the unit that the file states, or rad/s.
+        Unit of the angular rates in the file, such as ``"deg/s"``. By default, the unit that the file states or
+        that its numbers show, or rad/s.
     accel_unit : str, optional
-        Unit of the accelerations in the file, such as ``"g"``. By default, the unit that the file states, or m/s².
+        Unit of the accelerations in the file, such as ``"g"``. By default, the unit that the file states or that
+        its numbers show, or m/s².
     temperature_unit : str, optional
         Unit of the temperatures in the file, such as ``"K"``. By default, the unit that the file states, or °C.
     time_unit : str, optional
-        Unit of the times in the file, such as ``"ns"``. By default, the unit that the file states, or s.
+        Unit of the times in the file, such as ``"ns"``. By default, the unit that the file states or that its numbers
+        show, or s.
+    assume : bool, optional
+        True to use the likeliest unit if the numbers of a table fit several units. By default, such a table is refused.
 
     Returns
     -------
@@ -214,6 +220,7 @@ def read_recording(
             "accel_unit": accel_unit,
             "temperature_unit": temperature_unit,
             "time_unit": time_unit,
+            "assume": assume,
         }
     )
     return to_public(recordings.load_samples(Path(path), rate_hz, last_s, options))

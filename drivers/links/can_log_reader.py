@@ -7,6 +7,7 @@ is exceeded.
 
 import csv
 import io
+import re
 import zlib
 from collections.abc import Callable, Generator, Iterator
 from typing import IO, Any, BinaryIO, Final, cast
@@ -17,8 +18,44 @@ from can.io import blf
 from drivers.data_types import EXTENDED_ID, Chunk
 from drivers.recordings.table import T_LIMIT_S
 
+_SCREEN_LINE: Final = re.compile(
+    r"\s*(?P<t>\(\S+\))\s+(?P<channel>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+"
+    r"\[(?P<size>\d+)\] +(?P<data>[0-9A-Fa-f]{2}(?: [0-9A-Fa-f]{2})*|)"
+)
+
+
+class _CandumpReader(can.CanutilsLogReader):
+    """Reader of the log files of ``candump -l``, and of the lines that ``candump -t a`` prints on the screen."""
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        """Yield the frames."""
+        self.file = cast(Any, _LogLines(self.file))
+        yield from super().__iter__()
+
+
+class _LogLines:
+    """Text file whose lines are those of a log file of ``candump -l``."""
+
+    def __init__(self, text: IO[str]) -> None:
+        self._text = text
+        self.close = text.close
+
+    def __iter__(self) -> Iterator[str]:
+        return map(_to_log_line, self._text)
+
+
+def _to_log_line(line: str) -> str:
+    """Return a line of a log file for a line such as `` (1.5)  can0  100   [2]  3F 00``. Keep other lines."""
+    found = _SCREEN_LINE.match(line)
+    if found is None or "remote" in line:
+        return line
+    data = found["data"].replace(" ", "")
+    mark = "##0" if len(found["size"]) > 1 else "#"  # two digits mean CAN FD
+    return f"{found['t']} {found['channel']} {found['id']}{mark}{data}"
+
+
 TEXT_READERS: Final[dict[str, type[can.io.generic.TextIOMessageReader]]] = {
-    ".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader, ".csv": can.CSVReader,
+    ".asc": can.ASCReader, ".log": _CandumpReader, ".trc": can.TRCReader, ".csv": can.CSVReader,
 }  # fmt: skip
 MAX_STANDARD_ID: Final = 0x7FF
 MAX_EXTENDED_ID: Final = 0x1FFF_FFFF

@@ -18,6 +18,7 @@ from drivers.recordings.file_formats import (
     ros_bag_format,
 )
 from drivers.recordings.file_formats import parquet_and_arrow_format as arrow_format
+from drivers.recordings.file_formats.csv_header import is_table_text
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 from drivers.recordings.table_layout import convert_to_si
@@ -41,8 +42,6 @@ def _table_format(read: Callable[[Path, ReadingOptions], Table], open_writer: Op
     """Return the format of a file that contains a single table and no topics."""
 
     def read_table(path: Path, options: ReadingOptions) -> Table:
-        if options.topic is not None:
-            raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {options.topic}")
         return convert_to_si(path, read(path, options), options)
 
     return Format(read_table, open_writer, any_columns=True)
@@ -101,6 +100,8 @@ def find_format(path: Path) -> Format:
     if csv_per_sensor_format.is_sensor_folder(path):
         return _SENSOR_FILES
     suffix = _suffix(path)
+    if not suffix and path.is_file() and is_table_text(path):
+        suffix = ".csv"
     if not suffix:
         raise ConfigError(
             f"{path}: the suffix is not that of a recording; known are {' '.join(FORMATS)}"

@@ -33,7 +33,8 @@ class ReadingOptions(SettingsModel):
     topic: str | None = Field(
         None,
         examples=["/imu/data"],
-        description="topic of a ROS bag or an autopilot log; absent: the only topic with IMU data",
+        description="topic of a ROS bag or an autopilot log, or one of several sensors of a table; absent: the only "
+        "one with IMU data",
     )
     columns: dict[Annotated[str, one_of(COLUMNS)], Annotated[str, BeforeValidator(_to_column_reference)]] = Field(
         {},
@@ -44,10 +45,12 @@ class ReadingOptions(SettingsModel):
     gyro_unit: Annotated[str, checked_by(units.angular_rate_factor)] | None = Field(
         None,
         examples=["deg/s"],
-        description="unit of gx gy gz in the file; absent: unit that the file states, or rad/s",
+        description="unit of gx gy gz in the file; absent: unit that the file states or its numbers show, or rad/s",
     )
     accel_unit: Annotated[str, checked_by(units.acceleration_factor)] | None = Field(
-        None, examples=["g"], description="unit of ax ay az in the file; absent: unit that the file states, or m/s²"
+        None,
+        examples=["g"],
+        description="unit of ax ay az in the file; absent: unit that the file states or its numbers show, or m/s²",
     )
     temperature_unit: Annotated[str, checked_by(units.temperature_factor_and_offset)] | None = Field(
         None,
@@ -55,8 +58,11 @@ class ReadingOptions(SettingsModel):
         description="unit of the temperature in the file; absent: unit that the file states, or °C",
     )
     time_unit: Annotated[str, checked_by(units.time_factor)] | None = Field(
-        None, examples=["ns"], description="unit of t in the file; absent: unit that the file states, or s"
+        None,
+        examples=["ns"],
+        description="unit of t in the file; absent: unit that the file states or its numbers show, or s",
     )
+    assume: bool = Field(False, description="use the likeliest unit if the units of a table are doubtful")
 
 
 OPTION_NAMES: Final = {key: f"--{key.replace('_', '-')}" for key in ReadingOptions.model_fields}

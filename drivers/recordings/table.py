@@ -1,5 +1,6 @@
 """Types and functions that all recording formats share."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -16,6 +17,9 @@ from drivers.recordings import memory_check
 
 COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the columns that the readers recognize."""
+
+SENSOR: Final = "sensor"
+"""Column that tells the rows of several sensors apart, if a table has one."""
 
 TIME_NS: Final = "t_ns"
 """Column of the times in ns as int64. It replaces ``t`` if the source contains times in whole ns, µs or ms, because
@@ -57,6 +61,8 @@ class Table:
     fs: float | None  # sample rate in Hz; None if the file states no rate
     notes: list[str]
     units: Mapping[str, str] = field(default_factory=dict)  # units that the file states
+    names: Mapping[str, str] = field(default_factory=dict)  # column name of each quantity whose unit may be inferred
+    sensors: Sequence[str] = ()  # name of the sensor for each number in SENSOR; empty if the numbers are names
 
 
 def column_dtype(name: str) -> np.dtype[Any]:
@@ -127,6 +133,13 @@ CONTENTS: Final = (
 """For each type of file: the first bytes, the name of the type, and the suffixes of recordings of this type."""
 
 
+NO_RECORDINGS: Final = (
+    (re.compile(rb"version https://git-lfs"), "a pointer of Git LFS: fetch the file with `git lfs pull`"),
+    (re.compile(rb"\s*<(?:!doctype html|html)", re.IGNORECASE), "an HTML page: download the file itself"),
+)
+"""Start and description of files that were fetched in place of a recording, with the remedy."""
+
+
 def describe_suffix_mismatch(path: Path) -> str:
     """Return an error text about a file whose content does not match its suffix.
 
@@ -137,6 +150,9 @@ def describe_suffix_mismatch(path: Path) -> str:
             start = file.read(256)
     except OSError:
         return ""
+    for pattern, what in NO_RECORDINGS:
+        if pattern.match(start):
+            return f"; its content is {what}"
     for magic, what, suffixes in CONTENTS:
         if start.startswith(magic):
             if path.name.lower().endswith(suffixes or ("",)) and suffixes:

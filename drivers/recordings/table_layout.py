@@ -1,36 +1,34 @@
 """Layout of a table: the column that contains each quantity, and the unit of the column.
 
-The options of the user and the column names of the file determine the layout. The same rules apply to all tables: CSV,
-.npz, Parquet, Arrow and MATLAB files.
-
-A column name consists of a sensor, an axis and a unit, such as ``gyro_x [deg/s]``, ``wx (rad/s)`` or ``acc_x_g``. The
-names of these programs are among the recognized names:
-
-- EuRoC and TUM VI (ASL format): ``#timestamp [ns],w_RS_S_x [rad s^-1],a_RS_S_x [m s^-2]`` (the header that public
-  readers and writers of these data sets quote)
-- phyphox: ``"Time (s)","Gyroscope x (rad/s)"`` (phyphox/phyphox-android, ``DataExport.java``)
-- Sensor Logger: ``time,seconds_elapsed,z,y,x`` in ``Gyroscope.csv`` (tszheichoi/awesome-sensor-logger, ``UNITS.md``)
-- AndroSensor: ``ACCELEROMETER X (m/s²);…;TIME SINCE START (ms)``
-- Betaflight: ``loopIteration, time (us), gyroADC[0], accSmooth[0]`` (betaflight/blackbox-tools, ``blackbox_decode.c``)
-- ``rostopic echo -p``: ``%time,field.angular_velocity.x,field.linear_acceleration.x``
+The options of the user, the column names (``column_names``) and the numbers (``unit_inference``) determine the layout,
+in this order. The same rules apply to all tables: CSV, .npz, Parquet, Arrow and MATLAB files.
 """
 
-import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, cast
 
 import numpy as np
 
-from drivers import units
 from drivers.data_types import AXES, NS_PER_S, Floats, Times
 from drivers.errors import ConfigError, RecordingError
+from drivers.recordings.column_names import (
+    KIND_OF,
+    KINDS,
+    UNSCALED,
+    ColumnName,
+    find_ending_unit,
+    names_sensor,
+    parse_column_name,
+    split_unit,
+)
 from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table import (
     COLUMNS,
     NO_TIME_NS,
+    SENSOR,
     TIME_NS,
     Table,
     check_column_count,
@@ -38,103 +36,24 @@ from drivers.recordings.table import (
     format_name_list,
     integers_to_ns,
 )
+from drivers.recordings.topic_selection import HOW_TO_CHOOSE
+from drivers.recordings.unit_inference import infer_units
 from drivers.validation.module_lookup import format_suggestion
 
-
-@dataclass(frozen=True, slots=True)
-class QuantityKind:
-    """Quantities that share a unit."""
-
-    quantities: tuple[str, ...]  # names in COLUMNS
-    si_unit: str
-    option: str  # option of the commands that states the unit
-    convert: Callable[[str], tuple[float, float]]  # returns factor and offset of a unit; ConfigError if unknown
-    suffixes: Mapping[str, str]  # unit for each ending of a column name, in lower case and without separators
-
-    @property
-    def key(self) -> str:
-        """Field of ``ReadingOptions`` that states the unit."""
-        return self.option.removeprefix("--").replace("-", "_")
-
-
-KINDS: Final = (
-    QuantityKind(
-        AXES[:3], "rad/s", "--gyro-unit", lambda unit: (units.angular_rate_factor(unit), 0.0),
-        {
-            "rads": "rad/s", "radps": "rad/s", "radsec": "rad/s", "mrads": "mrad/s", "degs": "deg/s", "degps": "deg/s",
-            "degsec": "deg/s", "dps": "dps", "mdps": "mdps",
-        },
-    ),
-    QuantityKind(
-        AXES[3:], "m/s²", "--accel-unit", lambda unit: (units.acceleration_factor(unit), 0.0),
-        {"g": "g", "mg": "mg", "ug": "ug", "ms2": "m/s²", "mps2": "m/s²", "mss": "m/s²", "ms²": "m/s²"},
-    ),
-    QuantityKind(
-        ("temperature",), "°C", "--temperature-unit", units.temperature_factor_and_offset,
-        {"c": "°C", "degc": "°C", "celsius": "°C", "k": "K", "kelvin": "K", "f": "°F", "degf": "°F"},
-    ),
-    QuantityKind(
-        ("t",), "s", "--time-unit", lambda unit: (units.time_factor(unit), 0.0),
-        {
-            "s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milliseconds": "ms",
-            "us": "us", "usec": "us", "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
-        },
-    ),
-)  # fmt: skip
-KIND_OF: Final[Mapping[str, QuantityKind]] = {name: kind for kind in KINDS for name in kind.quantities}
-
-SENSOR_NAMES: Final[Mapping[str, tuple[str, int]]] = {
-    **dict.fromkeys(
-        (
-            "g", "w", "gyr", "gyro", "gyros", "gyroscope", "omega", "angular velocity", "angular rate", "ang vel",
-            "angvel", "rotation rate", "w rs s", "gyro adc", "gyroscope uncalibrated",
-        ),
-        ("g", 1),
-    ),
-    **dict.fromkeys(
-        (
-            "a", "acc", "accel", "acceleration", "accelerometer", "specific force", "a rs s", "acc smooth", "acc adc",
-            "total acceleration", "accelerometer uncalibrated",
-        ),
-        ("a", 1),
-    ),
-    # On phones, these names mean the acceleration without gravity.
-    **dict.fromkeys(("linear acceleration", "linear accelerometer", "lin acc", "user acceleration"), ("a", 2)),
-}  # fmt: skip
-"""Letter and rank of each sensor. The keys are the words before the axis in a column name. A lower rank is
-preferred."""
-TIME_NAMES: Final[Mapping[str, tuple[int, str | None]]] = {
-    "seconds elapsed": (1, "s"), "time since start": (1, None), "time since start in": (1, None),
-    "elapsed time": (1, None), "header stamp": (1, None), "timestamp": (2, None), "time stamp": (2, None),
-    "time": (2, None), "stamp": (2, None), "unix time": (2, None), "t": (2, None), "millis": (3, "ms"),
-    "micros": (3, "us"),
-}  # fmt: skip
-"""Rank and implied unit of each column name that contains times."""
-TEMPERATURE_NAMES: Final = frozenset(
-    ("temperature", "temp", "chip temperature", "chip temp", "die temperature", "die temp")
-)
-LEADING_WORDS: Final = frozenset(("imu", "field", "data", "sensor"))
-"""Words that are ignored at the start of a column name."""
-ASSUMED_UNITS: Final = {"gyro adc": "deg/s", "acc smooth": "g/2048"}
-"""Units of columns that never state their unit."""
 BETAFLIGHT_NOTE: Final = (
     "The Betaflight log states no units: gyroADC is read in deg/s and accSmooth in g/2048. For logs with "
     "blackbox_high_resolution, give --gyro-unit deg/s/10. For another acc_1G than 2048 in the header of the log, give "
     "--accel-unit g/acc_1G, such as g/4096."
 )
-_BRACKETED: Final = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]*[^\W\d_][^\[\]()]*?)\s*[\])]\s*$")
-_INDEX: Final = re.compile(r"\[([012])\]")
-_WORDS: Final = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])|\d+|²")
 
+MAX_LISTED_NAMES: Final = 60
+"""Number of column names in the message about a table without axes. The needed names may be the last ones."""
+MAX_SENSORS: Final = 32
+"""Number of different values up to which a column can tell the rows of several sensors apart."""
 
-@dataclass(frozen=True, slots=True)
-class ColumnName:
-    """Meaning of a column name."""
-
-    quantity: str  # name in COLUMNS
-    rank: int  # at most 0 for the names of this program; a lower rank is preferred
-    unit: str | None  # unit that the name states; None if it states none
-    assumed: str | None = None  # unit of the column if nothing states it; None for the SI unit
+MIN_INTERLEAVED_ROWS: Final = 240
+MIN_SEPARATION: Final = 5.0
+"""Ratio of the difference of two means to the standard deviation from which alternating rows belong to two sensors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +62,7 @@ class TableLayout:
 
     columns: dict[str, int]  # index of the column of each quantity, in the order of COLUMNS
     units: dict[str, str]  # unit of each quantity that the file states or implies
+    names: dict[str, str]  # column name of each quantity
 
 
 def find_layout(
@@ -185,6 +105,8 @@ def find_layout(
     }
     _check_used_once(path, names, chosen)
     meanings = {i: meaning for i, name in enumerate(names) if (meaning := parse_column_name(name, sensor)) is not None}
+    sensor_column = next((i for i, name in enumerate(names) if names_sensor(name) and i not in chosen.values()), None)
+    meanings = _select_named_sensor(path, meanings, options, sensor_column is not None)
     for quantity in COLUMNS:
         if quantity not in options.columns:
             free = {i: one for i, one in meanings.items() if one.quantity == quantity and i not in chosen.values()}
@@ -192,47 +114,185 @@ def find_layout(
                 chosen[quantity] = _select_candidate(path, names, quantity, free)
     if not any(axis in chosen for axis in AXES):
         raise RecordingError(
-            f"{path}: no axis among its columns ({format_name_list(names)}){where}; a recording has some of "
-            f"{' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
+            f"{path}: no axis among its columns ({format_name_list(names, MAX_LISTED_NAMES)}){where}; a recording "
+            f"has some of {' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
             f"{describe_suffix_mismatch(path)}"
         )
+    if sensor_column is not None:
+        chosen[SENSOR] = sensor_column
     others = [name for i, name in enumerate(names) if i not in chosen.values() and name not in ("", "fs")]
     if others:
         notes.append(f"Other columns are not used: {format_name_list(others)}.")
     return TableLayout(
-        {quantity: chosen[quantity] for quantity in COLUMNS if quantity in chosen},
+        {quantity: chosen[quantity] for quantity in (*COLUMNS, SENSOR) if quantity in chosen},
         _stated_units(names, chosen, meanings, options, notes),
+        {quantity: quantity if sensor and names[i] in ("x", "y", "z") else names[i] for quantity, i in chosen.items()},
     )
 
 
 def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
     """Return a table with columns in SI units and °C. Integer times in ns, µs or ms become the column ``t_ns``.
 
-    A unit in the options takes precedence over the unit that the file states.
+    A unit in the options takes precedence over the unit that the file states. If neither states the unit, it is
+    inferred from the numbers.
 
     Raises
     ------
     ConfigError
-        If the file states an unknown unit.
+        If the file states an unknown unit, or if the numbers fit several units.
     """
-    columns, notes = {}, list(table.notes)
+    notes = list(table.notes)
+    stated = table.units
+    table = _select_rows_of_sensor(path, table, options)
+    if table.names:
+        _check_interleaving(path, table.columns)
+    table = _infer_units(path, table, options, notes)
+    columns = {}
     for quantity, column in table.columns.items():
         if quantity == TIME_NS:
             columns[TIME_NS] = column
             continue
-        kind = KIND_OF[quantity]
-        try:
-            factor, offset = kind.convert(find_unit(table, options, quantity))
-        except ConfigError as error:
-            raise ConfigError(f"{path}: column of {quantity}: {error}; state the unit with {kind.option}") from None
+        factor, offset = _find_conversion(path, quantity, find_unit(table, options, quantity))
         name, numbers = _convert(quantity, column, factor, offset)
         columns[name] = numbers
     for kind in KINDS:
         given = getattr(options, kind.key)
-        contradicted = sorted({table.units[one] for one in kind.quantities if one in table.units} - {given})
+        contradicted = sorted({stated[one] for one in kind.quantities if one in stated} - {given})
         if given is not None and contradicted:
             notes.append(f"The file states {', '.join(contradicted)}; the requested {given} is used.")
     return Table(columns, table.fs, notes, table.units)
+
+
+def _select_named_sensor(
+    path: Path, meanings: Mapping[int, ColumnName], options: ReadingOptions, has_sensor_column: bool
+) -> dict[int, ColumnName]:
+    """Return the columns of one of several sensors whose names are part of the column names, such as ``imu2_gyro_x``.
+
+    Raises
+    ------
+    ConfigError
+        If the user must choose a sensor, or if the chosen sensor does not exist.
+    """
+    axes = {i: one for i, one in meanings.items() if one.quantity in AXES and one.quantity not in options.columns}
+    sensors = sorted({one.sensor for one in axes.values()} - {""})
+    topic = options.topic
+    if topic in sensors:
+        return {i: one for i, one in meanings.items() if i not in axes or one.sensor == topic}
+    if topic is not None and not has_sensor_column:
+        if sensors:
+            raise ConfigError(f'{path}: has no sensor "{topic}"; it has {", ".join(sensors)}')
+        raise ConfigError(f"{path}: contains a single table and no topics; leave out the topic {topic}")
+    unnamed = {one.quantity for one in axes.values() if not one.sensor}
+    counts = Counter(one.quantity for one in axes.values() if one.sensor and one.quantity not in unnamed)
+    if len(sensors) > 1 and counts and max(counts.values()) > 1:
+        of_sensor = {sensor: [one.quantity for one in axes.values() if one.sensor == sensor] for sensor in sensors}
+        listed = "; ".join(f"{sensor} ({' '.join(quantities)})" for sensor, quantities in of_sensor.items())
+        raise ConfigError(
+            f"{path}: contains the columns of {len(sensors)} sensors: {listed}; {HOW_TO_CHOOSE}, such as {sensors[0]}"
+        )
+    return dict(meanings)
+
+
+def _select_rows_of_sensor(path: Path, table: Table, options: ReadingOptions) -> Table:
+    """Return the rows of one sensor of a table with a column that tells the rows of several sensors apart.
+
+    Raises
+    ------
+    ConfigError
+        If the user must choose a sensor, or if the chosen sensor does not exist.
+    """
+    columns = dict(table.columns)
+    codes = columns.pop(SENSOR, None)
+    if codes is None:
+        return table
+    found, counts = np.unique(codes[np.isfinite(codes)], return_counts=True)
+    rest = Table(columns, table.fs, table.notes, table.units, {q: n for q, n in table.names.items() if q != SENSOR})
+    if not 1 < found.size <= MAX_SENSORS:  # a single sensor, or a counter
+        return rest
+    column = table.names[SENSOR]
+    values = [table.sensors[int(code)] if table.sensors else f"{code:g}" for code in found]
+    topics = [f"{column}={value}" for value in values]
+    if options.topic is None:
+        listed = ", ".join(f"{topic} ({count} rows)" for topic, count in zip(topics, counts.tolist(), strict=True))
+        raise ConfigError(
+            f"{path}: contains the rows of {found.size} sensors: {listed}; {HOW_TO_CHOOSE}, such as {topics[0]}"
+        )
+    match = [code for code, *known in zip(found, topics, values, strict=True) if options.topic in known]
+    if not match:
+        raise ConfigError(f'{path}: has no rows of "{options.topic}"; it has {", ".join(topics)}')
+    rows = codes == match[0]
+    return replace(rest, columns={quantity: values[rows] for quantity, values in columns.items()})
+
+
+def _check_interleaving(path: Path, columns: Mapping[str, Times]) -> None:
+    """Raise RecordingError if the rows of several sensors alternate without a column that tells them apart.
+
+    The values of every k-th row then agree with each other, and differ from those of the other rows.
+    """
+    for axis in AXES:
+        column = columns.get(axis)
+        if column is None or column.size < 2 * MIN_INTERLEAVED_ROWS:
+            continue
+        for sensors in (2, 3, 4):
+            starts = (0, (column.size - MIN_INTERLEAVED_ROWS) // 2, column.size - MIN_INTERLEAVED_ROWS)
+            parts = [column[at : at + MIN_INTERLEAVED_ROWS].reshape(-1, sensors) for at in starts]
+            if all(np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() > 0.0 for part in parts):
+                raise RecordingError(
+                    f"{path}: every {['second', 'third', 'fourth'][sensors - 2]} row of {axis} agrees, and the others "
+                    f"differ: the rows of {sensors} sensors alternate; add a column that names the sensor, such as "
+                    "imu, or write one file for each sensor"
+                )
+
+
+def _find_conversion(path: Path, quantity: str, unit: str) -> tuple[float, float]:
+    """Return factor and offset of a unit. Raise ConfigError if the unit is unknown."""
+    kind = KIND_OF[quantity]
+    try:
+        return kind.convert(unit)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: column of {quantity}: {error}; state the unit with {kind.option}") from None
+
+
+def _infer_units(path: Path, table: Table, options: ReadingOptions, notes: list[str]) -> Table:
+    """Return a table with the inferred units of the quantities whose unit neither the file nor the user states.
+
+    Raises
+    ------
+    ConfigError
+        If the numbers fit several units and the user does not accept the likeliest.
+    """
+    if not table.names:
+        return table
+    stated = dict(table.units)
+    for kind in KINDS:
+        of_triad = {stated[one] for one in kind.quantities if one in stated}
+        unit = getattr(options, kind.key)
+        if unit is not None:
+            stated |= dict.fromkeys(kind.quantities, unit)
+        elif len(of_triad) == 1:  # the unit of one axis is that of the triad
+            stated |= dict.fromkeys(kind.quantities, of_triad.pop())
+    for quantity in table.columns:
+        if quantity in stated and stated[quantity].lower() not in UNSCALED:
+            _find_conversion(path, quantity, stated[quantity])
+    found = infer_units(table.columns, table.names, stated, table.fs)
+    inferred = [kind for kind in KINDS if kind.name in found.reasons]
+    doubtful = [kind for kind in inferred if kind.name in found.alternatives]
+    if doubtful and not options.assume:
+        doubts = "; ".join(f"{kind.name} in {' or '.join(found.alternatives[kind.name])}" for kind in doubtful)
+        stating = " ".join(f"{kind.option} {found.likeliest[kind.name]}" for kind in doubtful)
+        raise ConfigError(
+            f"{path}: the file states no unit, and its numbers fit several: {doubts}. State the unit, such as "
+            f"{stating}, or accept the likeliest with --assume"
+        )
+    said = [
+        f"{kind.name} in {found.reasons[kind.name]}"
+        for kind in inferred
+        if found.likeliest[kind.name] != kind.si_unit or kind in doubtful
+    ]
+    if said:
+        what = "The likeliest units are assumed" if doubtful else "Units found from the numbers"
+        notes.append(f"{what}: {'; '.join(said)}.")
+    return Table(table.columns, table.fs, notes, {**stated, **found.units}, table.names)
 
 
 def find_unit(table: Table, options: ReadingOptions, quantity: str) -> str:
@@ -252,70 +312,6 @@ def names_an_axis(names: Sequence[str]) -> bool:
     return any((meaning := parse_column_name(name)) is not None and meaning.quantity in AXES for name in names)
 
 
-def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
-    """Return the meaning of a column name, or None if the name is not recognized.
-
-    >>> parse_column_name("gyro_x [deg/s]")
-    ColumnName(quantity='gx', rank=1, unit='deg/s', assumed=None)
-    >>> parse_column_name("z", sensor="TotalAcceleration").quantity
-    'az'
-    """
-    if name in COLUMNS:
-        return ColumnName(name, 0, None)
-    if name == TIME_NS:
-        return ColumnName("t", -1, "ns")
-    stem, unit = _split_unit(name)
-    words = [] if stem.strip() == "T" else _split_words(stem)  # T is a time or a temperature
-    for at in range(len(words), 0, -1):
-        found = _match_words(words[:at], sensor)
-        if found is None:
-            continue
-        ending = "".join(words[at:])
-        if not ending:
-            return ColumnName(found.quantity, found.rank, unit or found.unit, found.assumed)
-        if unit is None and ending in (suffixes := KIND_OF[found.quantity].suffixes):
-            return ColumnName(found.quantity, found.rank, suffixes[ending])
-    return None
-
-
-def _match_words(words: Sequence[str], sensor: str) -> ColumnName | None:
-    """Return the meaning of the words of a column name without its unit."""
-    text = " ".join(words)
-    if text in TIME_NAMES:
-        rank, unit = TIME_NAMES[text]
-        return ColumnName("t", rank, unit)
-    if text in TEMPERATURE_NAMES:
-        return ColumnName("temperature", 1, None)
-    axis = words[-1][-1]
-    before = " ".join(one for one in (*words[:-1], words[-1][:-1]) if one)
-    if axis not in "xyz":
-        return None
-    before = before or " ".join(_split_words(sensor))
-    if before not in SENSOR_NAMES:
-        return None
-    letter, rank = SENSOR_NAMES[before]
-    return ColumnName(letter + axis, rank, None, ASSUMED_UNITS.get(before))
-
-
-def _split_unit(name: str) -> tuple[str, str | None]:
-    """Split ``gyro x [deg/s]`` into name and unit. The unit is None if the name has no brackets with a unit."""
-    found = _BRACKETED.match(name)
-    return (found[1], found[2]) if found else (name, None)
-
-
-def _split_words(text: str) -> list[str]:
-    """Return the words of a column name in lower case, without words such as ``imu`` at the start.
-
-    >>> _split_words("gyroADC[0]"), _split_words("imu.AngularVelocity.x")
-    (['gyro', 'adc', 'x'], ['angular', 'velocity', 'x'])
-    """
-    indexed = _INDEX.sub(lambda index: " " + "xyz"[int(index[1])], text)
-    words = [word.lower() for word in _WORDS.findall(indexed)]
-    while len(words) > 1 and (words[0] in LEADING_WORDS or words[0].isdigit()):
-        del words[0]
-    return words
-
-
 def _find_given_column(path: Path, names: Sequence[str], quantity: str, column: str) -> int:
     """Return the index of a column that the user names, by its number, its name, or its name without the unit."""
     option = f"--columns {quantity}={column}"
@@ -323,7 +319,7 @@ def _find_given_column(path: Path, names: Sequence[str], quantity: str, column: 
         if not 1 <= int(column) <= len(names):
             raise ConfigError(f"{path}: {option}: there is no column {column}; the file has {len(names)} columns")
         return int(column) - 1
-    for spelled in (list(names), [_split_unit(name)[0] for name in names]):
+    for spelled in (list(names), [split_unit(name)[0] for name in names]):
         if spelled.count(column) > 1:
             raise ConfigError(f"{path}: {option}: {spelled.count(column)} columns have this name; give a number")
         if column in spelled:
@@ -346,6 +342,8 @@ def _select_candidate(path: Path, names: Sequence[str], quantity: str, candidate
     """Return the column with the lowest rank. Raise RecordingError if several columns have this rank."""
     lowest = min(one.rank for one in candidates.values())
     best = [i for i, one in candidates.items() if one.rank == lowest]
+    if quantity == "t" and len(stated := [i for i in best if candidates[i].unit is not None]) == 1:
+        best = stated
     if len({names[i] for i in best}) < len(best):
         raise RecordingError(f"{path}: column {names[best[0]]} occurs twice; each may occur once")
     if len(best) > 1:
@@ -373,37 +371,20 @@ def _stated_units(
     found = {}
     assumes = False
     for quantity, i in chosen.items():
+        if quantity == SENSOR:
+            continue
         kind, meaning = KIND_OF[quantity], meanings.get(i)
         if meaning is None or KIND_OF[meaning.quantity] is not kind:
-            meaning = ColumnName(quantity, 0, _unit_of_other_name(names[i], kind))
+            meaning = ColumnName(quantity, 0, find_ending_unit(names[i], kind))
         unit = meaning.unit
         if unit is None and getattr(options, kind.key) is None:
             unit = meaning.assumed
             assumes = assumes or unit is not None
         if unit is not None:
-            found[quantity] = _correct_case(unit, kind)
+            found[quantity] = kind.find_unit(unit) or unit
     if assumes:
         notes.append(BETAFLIGHT_NOTE)
     return found
-
-
-def _unit_of_other_name(name: str, kind: QuantityKind) -> str | None:
-    """Return the unit in a column name whose other words are not recognized."""
-    stem, unit = _split_unit(name)
-    words = _split_words(stem)
-    endings = ("".join(words[at:]) for at in range(1, len(words)))
-    return unit or next((kind.suffixes[ending] for ending in endings if ending in kind.suffixes), None)
-
-
-def _correct_case(unit: str, kind: QuantityKind) -> str:
-    """Return a unit in lower case if only this spelling is known, as in ``RAD/S``."""
-    for spelled in (unit, unit.lower()):
-        try:
-            kind.convert(spelled)
-        except ConfigError:
-            continue
-        return spelled
-    return unit
 
 
 def _convert(quantity: str, column: Times, factor: float, offset: float) -> tuple[str, Times]:

@@ -17,14 +17,12 @@ import drivers.decoders
 from drivers.data_types import AXES, NO_TICK, CounterTimedFormat, Ints, SampleBlock, Times, Timing, make_block
 from drivers.decoders.base import Decoder, FilterReportingDecoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
-from drivers.host.safe_file_reading import open_regular_file
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
-from drivers.recordings.file_formats.csv_header import COMMENT_MARKS, parse_number, split_header
+from drivers.recordings.file_formats.csv_header import is_table_text
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
 from drivers.recordings.table import TIME_NS
-from drivers.recordings.table_layout import names_an_axis
 from drivers.timing.arrival_timeline import split_by_arrival_time
 from drivers.timing.sample_clock import SampleClock
 from drivers.validation import module_lookup
@@ -37,7 +35,6 @@ LINK_KEYS: Final = ("bytes_per_second", "channel")
 """Keys of the link ``replay`` that can be set in addition to the keys of the decoder."""
 CONTENTS: Final = {"log": "CAN frames", "capture": "captured bytes", "raw": "raw data"}
 """Description of each kind of file that needs a decoder."""
-MAX_HEADER_BYTES: Final = 1000
 READ_TIMEOUT_S: Final = 1.0
 MIN_STEP_BACK_S: Final = 60.0
 """Minimum duration in s of half the range of a counter for the detection of steps back.
@@ -93,9 +90,7 @@ def load_recording(
     with contextlib.suppress(ConfigError, OSError):  # load_samples describes an unknown or missing file
         kind = detect_file_kind(path) if path.exists() else None
     if decoder is None:
-        if kind in CONTENTS:
-            if kind in CARRIERS and _is_table(path):
-                raise ConfigError(f"{path}: contains a table of samples; rename the file to end in .csv")
+        if kind in CONTENTS and not (kind in CARRIERS and _is_table(path)):
             names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
         report_progress("reading", None)
@@ -112,14 +107,11 @@ def load_recording(
 
 
 def _is_table(path: Path) -> bool:
-    """Return True if the first line that is not a comment contains column names such as ``t,gx,gy,gz``."""
+    """Return True if a file with the suffix of a capture or of a CAN log contains a table."""
     try:
-        with open_regular_file(path) as file:
-            lines = file.read(MAX_HEADER_BYTES).decode("ascii", "replace").splitlines()
+        return is_table_text(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {describe_error(error)}") from error
-    names = split_header(next((line for line in lines if line and not line.startswith(COMMENT_MARKS)), ""))
-    return names_an_axis(names) and all(parse_number(name, ",") is None for name in names)
 
 
 def _decode_file(path: Path, choice: DecoderChoice, rate_hz: float | None) -> Recording:

@@ -86,7 +86,7 @@ def test_arrow_integers_with_missing_times(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["<i8", ">i8", "<u8"])
 def test_a_truncated_npz_file(tmp_path: Path, kind: str) -> None:
     t_ns = START_NS + np.arange(1000)
-    np.savez(tmp_path / "x.npz", gx=np.arange(1000.0), t_ns=t_ns.astype(kind))
+    np.savez(tmp_path / "x.npz", gx=1e-3 * np.arange(1000.0), t_ns=t_ns.astype(kind))
     data = (tmp_path / "x.npz").read_bytes()
     (tmp_path / "x.npz").write_bytes(data[: data.index(b"t_ns.npy") + 4200])
     times = load_samples(tmp_path / "x.npz").times

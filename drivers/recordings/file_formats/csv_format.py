@@ -11,6 +11,7 @@ lost. If the last line has no line ending, it is skipped, because its last numbe
 Lines are counted before parsing, so that ``drivers.recordings.memory_check`` can reject a file that is too large.
 """
 
+import codecs
 import gzip
 import io
 import re
@@ -38,9 +39,10 @@ from drivers.recordings.file_formats.csv_header import (
     parse_number,
     split_fields,
 )
+from drivers.recordings.file_formats.text_times import has_date, is_text_time, parse_text_time, unwrap_days
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.table_layout import find_layout
+from drivers.recordings.table_layout import TableLayout, find_layout
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
@@ -62,6 +64,8 @@ GZIP_LEVEL: Final = 1
 
 Rows = NDArray[np.void]
 """Structured array [lines] with a field for each quantity."""
+_Converters = dict[int | str, Callable[[str], Any]]
+"""For the index of each column that contains text: function that returns the number of a field."""
 
 
 class _FractionalTimeError(Exception):
@@ -130,11 +134,22 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
         layout = find_layout(
             label, header.names, options, notes, f" in line {header.number}" if header.number else "", source.sensor
         )
+        if header.has_units:
+            notes.append("The line after the header states the units.")
+        text_time = _find_text_time(header, layout)
+        converters: _Converters = {}
+        if text_time:
+            time_type = "i8"
+            layout.units["t"] = "ns"
+            converters[layout.columns["t"]] = parse_text_time
+        sensors: dict[str, int] = {}
+        if table.SENSOR in layout.columns:
+            converters[layout.columns[table.SENSOR]] = lambda field: sensors.setdefault(field.strip(' "'), len(sensors))
         use = list(layout.columns.values())
         dtype = np.dtype([(name, time_type if name == "t" else "f8") for name in layout.columns])
         parts: list[Rows] = []
         read = 0
-        for part in _parse_pieces(label, header, texts, use, dtype, bad):
+        for part in _parse_pieces(label, header, texts, use, dtype, bad, converters):
             parts.append(part)
             read += len(part)
             report_read_share(read, lines)
@@ -146,7 +161,17 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
     if not len(rows):
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
-    return table.Table({name: rows[name] for name in layout.columns}, None, notes, layout.units)
+    columns = {name: rows[name] for name in layout.columns}
+    if text_time and not has_date(text_time):
+        columns["t"] = unwrap_days(columns["t"])
+    return table.Table(columns, None, notes, layout.units, layout.names, tuple(sensors))
+
+
+def _find_text_time(header: CsvHeader, layout: TableLayout) -> str:
+    """Return the first time if the times are text such as ``2024-03-01 23:59:00.010``, or an empty text."""
+    fields = split_fields(header.sample or "", header.separator)
+    column = layout.columns.get("t", len(fields))
+    return fields[column] if column < len(fields) and is_text_time(fields[column]) else ""
 
 
 def _count_rows(source: CsvSource) -> int:
@@ -179,9 +204,9 @@ def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError
 
 def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
     """Yield the decompressed text of a plain or gzip file in pieces. Stop where the file is truncated or damaged."""
-    zipped = file.read(2) == GZIP_MAGIC
+    start = file.read(2)
     file.seek(0)
-    if not zipped:
+    if start != GZIP_MAGIC:
         yield from iter(lambda: file.read(READ_BYTES), b"")
         return
     unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
@@ -214,7 +239,11 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
     """Join and split pieces of text at line ends. Stop at a line that is longer than MAX_LINE_BYTES."""
     rest: list[bytes] = []  # parts of an incomplete line
     size = lines = 0
+    decoder: codecs.IncrementalDecoder | None = None
     for text in texts:
+        if decoder is None and not lines and text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            decoder = codecs.getincrementaldecoder("utf-16")("replace")
+        text = text if decoder is None else decoder.decode(text).encode()
         whole, end, tail = text.rpartition(b"\n")
         if end:
             piece = b"".join((*rest, whole, end))
@@ -231,17 +260,23 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 def _parse_pieces(
-    path: Path, header: CsvHeader, texts: Iterable[bytes], use: Sequence[int], dtype: np.dtype[Any], bad: _BadLines
+    path: Path,
+    header: CsvHeader,
+    texts: Iterable[bytes],
+    use: Sequence[int],
+    dtype: np.dtype[Any],
+    bad: _BadLines,
+    converters: _Converters,
 ) -> Iterator[Rows]:
-    """Yield the rows of each piece of CSV text."""
+    """Yield the rows of each piece of CSV text. ``converters`` contains the columns that are text."""
     number, rows = header.rest_number, 0
     for text in chain((header.rest,), texts):
         text = text.replace(b"\r\n", b"\n")
         if text.strip():
-            part = _parse_regular_lines(text, header, use, dtype)
+            part = _parse_regular_lines(text, header, use, dtype, converters)
             if part is None and (samples := NOT_SAMPLES.sub(b"", text)) != text and samples:
-                part = _parse_regular_lines(samples, header, use, dtype)
-            part = _parse_line_by_line(text, number, header, use, dtype, bad) if part is None else part
+                part = _parse_regular_lines(samples, header, use, dtype, converters)
+            part = _parse_line_by_line(text, number, header, use, dtype, bad, converters) if part is None else part
             rows += len(part)
             if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
                 raise _too_many_bad_lines(path, bad, rows)
@@ -249,7 +284,9 @@ def _parse_pieces(
         number += text.count(b"\n")
 
 
-def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any]) -> Rows | None:
+def _parse_regular_lines(
+    text: bytes, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], converters: _Converters
+) -> Rows | None:
     """Return the rows of lines, or None if any line is irregular."""
     if header.separator in DECIMAL_COMMA_SEPARATORS and b"," in text:
         text = text.replace(b",", b".")
@@ -269,13 +306,22 @@ def _parse_regular_lines(text: bytes, header: CsvHeader, use: Sequence[int], dty
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # some versions of NumPy read 1.5 as the integer 1
-            return np.loadtxt(lines, dtype, delimiter=header.separator or None, comments=None, usecols=use, ndmin=1)
+            return np.loadtxt(
+                lines, dtype, delimiter=header.separator or None, comments=None, usecols=use, ndmin=1,
+                converters=converters or None,
+            )  # fmt: skip
     except (ValueError, DeprecationWarning):
         return None
 
 
 def _parse_line_by_line(
-    text: bytes, number: int, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], bad: _BadLines
+    text: bytes,
+    number: int,
+    header: CsvHeader,
+    use: Sequence[int],
+    dtype: np.dtype[Any],
+    bad: _BadLines,
+    converters: _Converters,
 ) -> Rows:
     """Return the rows of lines. Invalid lines become missing values. Comment lines are skipped."""
     missing = tuple(table.NO_TIME_NS if dtype[i].kind == "i" else np.nan for i in range(len(use)))
@@ -284,19 +330,24 @@ def _parse_line_by_line(
         if not line.strip() or line.lstrip().startswith(COMMENT_MARKS):
             continue
         try:
-            rows.append(_parse_sample(line, header, use, dtype))
+            rows.append(_parse_sample(line, header, use, dtype, converters))
         except ValueError as error:
             bad.record_bad_line(number + offset, str(error))
             rows.append(missing)
     return np.array(rows, dtype)
 
 
-def _parse_sample(line: str, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any]) -> tuple[float, ...]:
+def _parse_sample(
+    line: str, header: CsvHeader, use: Sequence[int], dtype: np.dtype[Any], converters: _Converters
+) -> tuple[float, ...]:
     fields = split_fields(line, header.separator)
     if len(fields) != len(header.names):
         raise ValueError(f"{len(fields)} fields where the header has {len(header.names)}")
     row: list[float] = []
     for column, i in enumerate(use):
+        if i in converters:
+            row.append(converters[i](fields[i]))
+            continue
         number = parse_number(fields[i], header.separator)
         if number is None:
             raise ValueError(f"{header.names[i]} is {fields[i].strip()[:20]!a}")

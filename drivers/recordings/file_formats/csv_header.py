@@ -1,37 +1,45 @@
-"""Header line and separator of a CSV file.
+"""Header line and separator of a table in text.
 
 Fields are separated by commas, semicolons, tabs or blanks. Numbers in a file with semicolons or tabs may have decimal
-commas. The header is the first line that is not a comment. If this line consists of numbers, the header is the last
-comment with the same number of fields, as ``numpy.savetxt`` writes it. A file without a header can be read if the user
-gives the numbers of its columns.
+commas. The header is the first line that names an axis. Lines before it are skipped, whether or not they are marked as
+comments. If no line names an axis, the header is the line before the first samples. If a comment with the same number
+of fields precedes the first samples, this comment is the header, as ``numpy.savetxt`` writes it. A file without a
+header can be read if the user gives the numbers of its columns.
+
+A row of units may follow the header. Its units are appended to the column names, as in ``gyro_x [deg/s]``.
 """
 
 import csv
-import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Final
 
 from drivers.errors import RecordingError
+from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import table
+from drivers.recordings.column_names import KINDS, split_unit
 from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table_layout import names_an_axis
 
 MAX_PREAMBLE_BYTES: Final = 1 << 20
 """Maximum total size of the blank lines and comments before the header."""
 COMMENT_MARKS: Final = ("#", "%")
-UNKNOWN_COMMENT_MARKS: Final = ("//", ";", "--", "!", "*")
-"""Comment markers used by other programs; the error message about a missing header mentions them."""
+MAX_TABLE_START_BYTES: Final = 1 << 16
+MAX_PREAMBLE_LINES: Final = 500
+"""Number of lines that are searched for column names of an axis."""
+NO_UNITS: Final = ("", "-", "--", "n/a", "none", "None", "1", "bool", "count", "counts", "#")
+"""Fields in a row of units for columns without a unit."""
 BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 BLANKS: Final = ""
 """Separator of files whose fields are separated by any number of blanks."""
 SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", BLANKS: "blanks"}
 """Separators with their names. Commas follow semicolons and tabs, because they may also be decimal commas."""
 DECIMAL_COMMA_SEPARATORS: Final = (";", "\t")
-EXCEL_SEPARATOR: Final = re.compile("sep=.?", re.IGNORECASE)
-"""First line that tells Excel the separator."""
+_NO_ROW: Final = re.compile("[#%]|sep=.?$", re.IGNORECASE)
+"""Start of a comment, and the line that tells Excel the separator."""
 _QUOTED: Final = re.compile('"[^"]*"')
 
 
@@ -44,6 +52,8 @@ class CsvHeader:
     number: int  # number of the header line; 0 if the file has no header
     rest: bytes  # text after the header
     rest_number: int  # line number of the first line of ``rest``
+    sample: str | None  # first line of samples
+    has_units: bool = False  # True if a row of units follows the header
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,50 +84,60 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
         If the file has no header and the user does not give the numbers of the columns, or if the separators of header
         and samples differ.
     """
-    number = size = 0
-    comment: _Line | None = None
-    for text in texts:
-        for line in _iter_lines(text, number):
-            number, size = line.number, size + line.end - line.begin
-            if line.text.startswith(COMMENT_MARKS):
-                comment = line
-            elif line.text and not EXCEL_SEPARATOR.fullmatch(line.text):
-                return _header_at_first_line(path, label, comment, line, text, texts, options)
-            if size > MAX_PREAMBLE_BYTES:
-                raise RecordingError(
-                    f"{label}: has no header line within its first {number} lines, only comments and blank lines; "
-                    f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
-                )
-    if not number:
+    text = b""
+    for part in texts:
+        text += part
+        lines = list(_iter_lines(text, 0))
+        rows = [line for line in lines if line.text.strip() and not _NO_ROW.match(line.text)]
+        if len(rows) > 2:
+            break
+        if len(text) > MAX_PREAMBLE_BYTES:
+            searched = lines[-1].number
+            raise RecordingError(
+                f"{label}: has no header line within its first {searched} lines, only comments and blank lines; "
+                f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
+            )
+    if not text:
         return None
-    if comment is None or not names_an_axis(split_header(comment.text)):
-        raise RecordingError(
-            f"{label}: contains only comments and blank lines, expected a header such as {table.EXAMPLE_HEADER}"
-        )
-    return _build_header(path, label, comment, None, b"", number + 1)
+    comments = [line for line in lines if line.text.startswith(COMMENT_MARKS)]
+    if not rows:
+        if not comments or not names_an_axis(split_header(comments[-1].text)):
+            raise RecordingError(
+                f"{label}: contains only comments and blank lines, expected a header such as {table.EXAMPLE_HEADER}"
+            )
+        return _build_header(path, label, comments[-1], [], text, len(lines))
+    first, header = _find_header_row(rows)
+    before = [line for line in comments if line.number < rows[first].number]
+    if header is None and before and _is_header_comment(before[-1].text, rows[first].text):
+        header = before[-1]
+    if header is None:
+        return _build_numbered(label, rows[first], options, text[rows[first].begin :])
+    return _build_header(path, label, header, rows[first:], text, len(lines))
 
 
-def _header_at_first_line(
-    path: Path,
-    label: Path,
-    comment: _Line | None,
-    line: _Line,
-    text: bytes,
-    later_texts: Iterator[bytes],
-    options: ReadingOptions,
-) -> CsvHeader:
-    """Return the header, given the first line of ``text`` that is no comment, and the last comment before this line."""
-    if comment is not None and _is_header_comment(comment.text, line.text):
-        return _build_header(path, label, comment, line.text, text[line.begin :], line.number)
-    if _consists_of_numbers(line.text):
-        return _build_numbered(label, line, options, text[line.begin :])
-    number = line.number + 1
-    for rest in itertools.chain([text[line.end :]], later_texts):
-        sample = _first_sample(rest)
-        if sample is not None:
-            return _build_header(path, label, line, sample, rest, number)
-        number += rest.count(b"\n")
-    return _build_header(path, label, line, None, b"", number)
+def _find_header_row(rows: Sequence[_Line]) -> tuple[int, _Line | None]:
+    """Return the index of the first row after the header, and the header. It is None if the samples begin at once."""
+    for i, row in enumerate(rows[:MAX_PREAMBLE_LINES]):
+        if names_an_axis(split_header(row.text)):
+            return i + 1, row
+        fields = split_fields(row.text, _first_separator(row.text))
+        if len(fields) > 1 and _consists_of_numbers(row.text):
+            alike = i and len(split_header(rows[i - 1].text)) == len(fields)
+            return i, rows[i - 1] if alike or i == 1 else None
+    return (0, None) if _consists_of_numbers(rows[0].text) else (1, rows[0])
+
+
+def is_table_text(path: Path) -> bool:
+    """Return True if a text file contains a line of column names with an axis, and numbers in the next line."""
+    with open_regular_file(path) as file:
+        lines = list(_iter_lines(file.read(MAX_TABLE_START_BYTES), 0))
+    rows = [line.text for line in lines if line.text.strip()]
+    for row, following in pairwise(rows[:MAX_PREAMBLE_LINES]):
+        names = split_header(row)
+        if len(names) > 1 and names_an_axis(names):
+            fields = [field.strip() for field in split_fields(following, _first_separator(following))]
+            return _is_unit_row(fields, len(names)) or any(parse_number(field, ",") is not None for field in fields)
+    return False
 
 
 def split_fields(line: str, separator: str) -> list[str]:
@@ -157,18 +177,12 @@ def split_header(line: str, separator: str | None = None) -> list[str]:
     return [name.strip(' \t"') for name in fields]
 
 
-def _first_sample(text: bytes) -> str | None:
-    """Return the first line that is neither blank nor a comment, or None."""
-    lines = (line.text for line in _iter_lines(text, 1))
-    return next((line for line in lines if line and not line.startswith(COMMENT_MARKS)), None)
-
-
 def _iter_lines(text: bytes, number: int) -> Iterator[_Line]:
     begin = 0
     while (end := text.find(b"\n", begin)) >= 0:
         number += 1
         line = _decode(text[begin:end])
-        yield _Line((line.removeprefix(BOM) if number == 1 else line).strip(), number, begin, end + 1)
+        yield _Line((line.removeprefix(BOM) if number == 1 else line).strip(" \r"), number, begin, end + 1)
         begin = end + 1
 
 
@@ -201,29 +215,44 @@ def _is_header_comment(comment: str, line: str) -> bool:
     return alike and _consists_of_numbers(line) and len(names) == len(split_header(line)) > 1
 
 
-def _build_header(
-    path: Path, label: Path, header: _Line, sample: str | None, rest: bytes, rest_number: int
-) -> CsvHeader:
-    """Return the header with the separator that fits the first line of samples."""
-    text = header.text.lstrip("#% ")
-    if "\0" in text:
+def _build_header(path: Path, label: Path, header: _Line, rows: Sequence[_Line], text: bytes, lines: int) -> CsvHeader:
+    """Return the header with the separator that fits the first line of samples, given the rows after the header."""
+    names_text = header.text.lstrip("#% ")
+    if "\0" in names_text:
         raise RecordingError(
             f"{label}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
             f"{table.describe_suffix_mismatch(path)}"
         )
-    separator = _first_separator(text) if sample is None else _find_separator(label, header, sample)
-    table.check_column_count(label, text.count(separator or " ") + 1)
-    names = split_header(text, separator)
+    sample = rows[0].text if rows else None
+    separator = _first_separator(names_text) if sample is None else _find_separator(label, header, sample)
+    table.check_column_count(label, names_text.count(separator or " ") + 1)
+    names = split_header(names_text, separator)
+    units = [] if sample is None else [field.strip() for field in split_fields(sample, separator)]
+    has_units = _is_unit_row(units, len(names))
+    if has_units:
+        pairs = zip_longest(names, units[: len(names)], fillvalue="")
+        names = [_append_unit(name, unit) for name, unit in pairs]
+        rows = rows[1:]
+        sample = rows[0].text if rows else None
     fields = [] if sample is None else split_fields(sample, separator)
     if len(fields) == len(names) + 1 and not fields[-1].strip():
         names.append("")  # the lines of samples end with a separator
-    mark = next((mark for mark in UNKNOWN_COMMENT_MARKS if text.startswith(mark)), None)
-    if mark is not None and len(fields) not in (0, len(names)):
-        raise RecordingError(
-            f'{label}: line {header.number} begins with "{mark}" like a comment, but comments begin with # or %; '
-            "change the mark, or delete the line"
-        )
-    return CsvHeader(names, separator, header.number, rest, rest_number)
+    rest = text[rows[0].begin :] if rows else b""
+    return CsvHeader(names, separator, header.number, rest, rows[0].number if rows else lines + 1, sample, has_units)
+
+
+def _is_unit_row(fields: Sequence[str], columns: int) -> bool:
+    """Return True if the line after the header contains units: no numbers, and most of its fields are known units."""
+    given = [field for field in fields if field and field not in NO_UNITS]
+    if len(fields) not in (columns, columns + 1) or len(given) < min(columns, 2):
+        return False
+    known = [field for field in given if any(kind.find_unit(field) is not None for kind in KINDS)]
+    return 2 * len(known) >= len(given) and all(parse_number(field, ",") is None for field in given)
+
+
+def _append_unit(name: str, unit: str) -> str:
+    unit = unit.strip("[]() ")
+    return name if unit in NO_UNITS or split_unit(name)[1] is not None else f"{name} [{unit}]"
 
 
 def _find_separator(label: Path, header: _Line, sample: str) -> str:
@@ -271,4 +300,5 @@ def _build_numbered(label: Path, line: _Line, options: ReadingOptions, rest: byt
             f"{label}: line {line.number} has commas and blanks, and either can be the separator or the decimal comma; "
             "export the file with semicolons or tabs"
         )
-    return CsvHeader([f"column {i}" for i in range(1, len(fields) + 1)], separator, 0, rest, line.number)
+    names = [f"column {i}" for i in range(1, len(fields) + 1)]
+    return CsvHeader(names, separator, 0, rest, line.number, line.text)

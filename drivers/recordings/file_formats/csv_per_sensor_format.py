@@ -56,9 +56,10 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
     notes: list[str] = []
     tables: dict[str, table.Columns] = {}
     stated: dict[str, str] = {}
+    of_file = options.model_copy(update={"topic": None})
     with _open_sources(path) as sources:
-        for name in _select(path, sources, options, notes):
-            found = convert_to_si(path, read_csv_source(sources[name], options), options)
+        for name in _select(path, sources, options.topic, of_file, notes):
+            found = convert_to_si(path, read_csv_source(sources[name], of_file), of_file)
             if not {"t", table.TIME_NS} & {*found.columns}:
                 raise RecordingError(f"{sources[name].label}: has no times, expected a column such as seconds_elapsed")
             tables[name] = found.columns
@@ -67,7 +68,9 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
     return table.Table(join_topics(path, tables), None, notes, stated)
 
 
-def _select(path: Path, sources: Mapping[str, CsvSource], options: ReadingOptions, notes: list[str]) -> list[str]:
+def _select(
+    path: Path, sources: Mapping[str, CsvSource], topic: str | None, options: ReadingOptions, notes: list[str]
+) -> list[str]:
     """Return the names of the sensors to read."""
     topics = [_describe(source, name, options) for name, source in sources.items()]
     measured = {topic.name: topic.columns for topic in topics}
@@ -76,7 +79,7 @@ def _select(path: Path, sources: Mapping[str, CsvSource], options: ReadingOption
     accelerometers = _by_preference(ACCELEROMETERS, others)
     pairs = [JOIN.join((gyro, one)) for gyro in gyros[:1] for one in accelerometers if gyro in GYROSCOPES]
     imus = [[name] for name in (pairs or [*gyros, *accelerometers])]
-    return select_topics(path, topics, imus, options.topic, EXPECTED, notes)
+    return select_topics(path, topics, imus, topic, EXPECTED, notes)
 
 
 def _by_preference(preferred: tuple[str, ...], names: list[str]) -> list[str]:

@@ -60,7 +60,7 @@ def read_matlab(path: Path, options: ReadingOptions) -> table.Table:
     names = list(columns)
     layout = find_layout(path, names, options, notes)
     found = {quantity: table.to_column(quantity, columns[names[i]]) for quantity, i in layout.columns.items()}
-    return table.Table(found, fs, notes, layout.units)
+    return table.Table(found, fs, notes, layout.units, layout.names)
 
 
 def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], float | None]:

@@ -91,7 +91,7 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
                         quantity: table.to_column(quantity, _read_array(path, archive, names[i]))
                         for quantity, i in layout.columns.items()
                     }
-                return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units)
+                return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units, layout.names)
     arrays, cut = _recover_arrays(path, options)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
@@ -237,7 +237,7 @@ def _table_of_recovered(
         rest = np.full(n - column.size, np.nan if column.dtype == np.float64 else table.NO_TIME_NS)
         columns[short] = np.concatenate([column, rest])
     fs = _single_number(arrays["fs"], notes) if "fs" in arrays else None
-    return table.Table(columns, fs, notes, layout.units)
+    return table.Table(columns, fs, notes, layout.units, layout.names)
 
 
 def _recover_arrays(path: Path, options: ReadingOptions) -> tuple[dict[str, NDArray[Any]], str | None]:

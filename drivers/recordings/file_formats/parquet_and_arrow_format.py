@@ -244,7 +244,7 @@ def _build_table(
             columns[name] = table.to_column(name, whole.fill_null(missing).to_numpy())
         else:
             columns[name] = np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), np.float64)
-    return table.Table(columns, None, notes, units)
+    return table.Table(columns, None, notes, units, chosen)
 
 
 def first_message_line(error: Exception) -> str:

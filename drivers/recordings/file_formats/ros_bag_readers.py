@@ -58,6 +58,7 @@ INDEX_SIZE_OFFSET: Final = 51
 MCAP_FOOTER: Final = struct.Struct("<BQQQI8s")  # mcap.dev/spec: opcode, length, summary, summary offsets, CRC, magic
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 MCAP_RECORD: Final = struct.Struct("<BQ")  # opcode, length
+ROS1_PROFILE: Final = b"ros1"
 MCAP_SCHEMA: Final = 0x03
 MCAP_CHUNK_INDEX: Final = 0x08
 MCAP_CHUNK_HEADER_BYTES: Final = 9 + 40
@@ -201,6 +202,12 @@ def check_mcap_index(path: Path) -> None:
         file.seek(0)
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             return  # rosbags describes the error
+        head = file.read(MCAP_RECORD.size + 4 + len(ROS1_PROFILE))
+        if head.endswith(ROS1_PROFILE):
+            raise RecordingError(
+                f"{path}: contains messages of ROS 1 in MCAP, expected messages of ROS 2; read the bag (.bag) from "
+                "which the file was made, or export the topic of the IMU to CSV"
+            )
         file.seek(max(end - MCAP_FOOTER.size, 0))
         footer = file.read()
         if len(footer) < MCAP_FOOTER.size or not footer.endswith(MCAP_MAGIC):

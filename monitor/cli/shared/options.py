@@ -155,7 +155,8 @@ LENGTH_OPTIONS = {
 READING_OPTIONS = {
     "topic": _text_option(
         "NAME",
-        "Topic of a ROS bag or an autopilot log; by default the only topic with IMU data. A+B joins two topics.",
+        "Topic of a ROS bag or an autopilot log, or one of several sensors of a table; by default the only one with "
+        "IMU data. A+B joins two topics.",
     ),
     "columns": _text_option(
         "Q=COLUMN,…", "Columns of a table by name or number, e.g. gx=omega_x,t=1; by default recognized by name."
@@ -169,6 +170,9 @@ READING_OPTIONS = {
     ),
     "temperature_unit": _text_option("UNIT", f"Unit of the temperature in the file: {', '.join(units.TEMPERATURE)}."),
     "time_unit": _text_option("UNIT", f"Unit of the times in the file: {', '.join(units.TIME)}."),
+    "assume": Annotated[
+        bool | None, typer.Option("--assume", help="Use the likeliest unit if the units of a table are doubtful.")
+    ],
 }
 """Options that determine how a recording is read, by the field of ``ReadingOptions``."""
 DECODER_OPTIONS = {

@@ -160,6 +160,22 @@ def test_logs_of_python_can_are_replayed(tmp_path: Path, suffix: str) -> None:
     assert np.diff([c.t_ns for c in chunks]) == pytest.approx(np.full(len(FRAMES) - 1, 1e7), abs=2e5)
 
 
+@pytest.mark.parametrize(("flags", "end"), [("", ""), ("RX - - ", "   '.p..'"), ("TX B E ", "")])
+def test_screen_text_of_candump_is_replayed(tmp_path: Path, flags: str, end: str) -> None:
+    path = tmp_path / "screen.log"
+    lines = [
+        f" ({1_700_000_000.0 + 0.01 * i:.6f})  can0  {flags}{identifier:0{8 if extended else 3}X}   [{len(data)}]  "
+        f"{data.hex(' ').upper()}{end}\n"
+        for i, (identifier, extended, data) in enumerate(FRAMES)
+    ]
+    path.write_text("".join(lines))
+    chunks, _ = read_all(build(path))
+    assert [(c.address, c.data) for c in chunks] == [
+        (identifier | (EXTENDED_ID if extended else 0), data) for identifier, extended, data in FRAMES
+    ]
+    assert np.diff([c.t_ns for c in chunks]) == pytest.approx(np.full(len(FRAMES) - 1, 1e7), abs=2e5)
+
+
 def write_frames(path: Path) -> None:
     with gzip.open(path, "wt") as stream:
         stream.write("t,channel,id_hex,extended,dlc,data_hex\n")

@@ -750,7 +750,7 @@ def test_folder_without_recordings_is_refused(run_program: RunProgram) -> None:
 
 
 def test_a_rate_makes_a_recording_without_times_readable(run_program: RunProgram) -> None:
-    Path("x.csv").write_text("gx\n" + "0.1\n0.2\n0.4\n" * 40)
+    Path("x.csv").write_text("gx\n" + "0.001\n0.002\n0.004\n" * 40)
     run = run_program("analyze", "x.csv", "--rate", "50", "--json", "-")
     assert run.status == 0
     assert json.loads(run.out)["seconds"] == 120 / 50

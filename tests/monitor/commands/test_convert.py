@@ -77,7 +77,7 @@ def write_euroc_csv(folder: Path, _kind: str) -> Path:
 
 def write_matlab_file(folder: Path, _kind: str) -> Path:
     _, values, _ = make_samples()
-    savemat(folder / "in.mat", {"t_ns": T_NS, "gyro": values[:, :3], "acc": values[:, 3:]})
+    savemat(folder / "in.mat", {"t_ns": T_NS, **dict(zip(AXES, values.T, strict=True))})
     return folder / "in.mat"
 
 

@@ -113,7 +113,7 @@ def test_almost_constant_temperature_is_refused(tmp_path, capsys):
 
 def test_recording_without_temperature_is_refused(tmp_path, capsys):
     path = tmp_path / "none.npz"
-    np.savez(path, fs=1.0, gz=np.arange(100.0))
+    np.savez(path, fs=1.0, gz=1e-5 * np.arange(100.0))
     assert exit_status("thermal", "fit", path) == 2
     assert "there is no temperature" in capsys.readouterr().err
 

@@ -17,6 +17,9 @@ The first line that arrives after the link was opened is often incomplete. For e
 characters is read as ``12``. The first line is therefore skipped without being counted as bad. A first line with a
 correct checksum is kept, and ``first_line = "keep"`` keeps every first line. ``encode`` puts a line end before the
 first line of a block, so that only an empty line is skipped.
+
+If the column ``t`` advances by a power of 1000 faster or slower than the arrival times, ``time_unit`` is wrong. All
+lines are then rejected, because the rate and the noise coefficients would be wrong.
 """
 
 import re
@@ -48,6 +51,10 @@ OVERLONG_LINE: Final = b"\0"
 OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is the baud rate right?"
 DEVICE_WRAP: Final = 1 << 32
 """Number of counts after which ``millis()`` and ``micros()`` of Arduino boards wrap to 0."""
+TIME_UNITS: Final = ("s", "ms", "us", "ns")
+MIN_CLOCK_CHECK_S: Final = 0.5
+MIN_CLOCK_CHECK_LINES: Final = 20
+"""Duration and number of lines after which the column ``t`` is compared with the arrival times."""
 UNWRAPPED_TICKS: Final = 1 << 62
 """Modulus in ticks for a device clock that does not wrap. The modulus corresponds to 146 years."""
 
@@ -78,6 +85,9 @@ class TextDecoder(base.RejectingDecoder):
         self._first_line_ended = False  # True if the end of the first line has arrived
         self._lines_seen = 0  # number of lines since the link was opened
         self._builder.forget_missing_samples()
+        self._clock_start: tuple[float, int] | None = None  # first count and arrival time
+        self._clock_lines = 0  # number of lines with a count
+        self._clock_problem = ""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples in all lines that are complete after the given chunks."""
@@ -226,9 +236,33 @@ class TextDecoder(base.RejectingDecoder):
         if isinstance(self.timing, CounterTimedFormat):
             counts = scaled[:, self._column["t" if "t" in self._column else "counter"]]
             bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # the clock value is missing or implausible
+            if not bad.all():
+                self._check_time_unit(counts[~bad], t_ns[~bad])
+            if self._clock_problem:
+                bad[:] = True
+                self._rejection.note_rejection(self._clock_problem)
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         values[bad] = np.inf
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
+
+    def _check_time_unit(self, counts: Floats, t_ns: Ints) -> None:
+        """Compare the column ``t`` with the arrival times, and set ``_clock_problem`` if another unit fits."""
+        if "t" not in self._column or self._clock_problem:
+            return
+        first_count, first_ns = self._clock_start = self._clock_start or (float(counts[0]), int(t_ns[0]))
+        self._clock_lines += len(counts)
+        host_s, device_s = (int(t_ns[-1]) - first_ns) * 1e-9, (float(counts[-1]) - first_count) * TICK_S
+        if host_s < MIN_CLOCK_CHECK_S or self._clock_lines < MIN_CLOCK_CHECK_LINES or device_s <= 0.0:
+            return
+        configured = self._settings.time_unit
+        for unit in TIME_UNITS:
+            ratio = units.time_factor(configured) / units.time_factor(unit)
+            rate_hz = self._clock_lines / (device_s / ratio)
+            if unit != configured and 0.8 < device_s / host_s / ratio < 1.25 and 1.0 <= rate_hz <= 33_000.0:
+                self._clock_problem = (
+                    f"column t advances {device_s / host_s:.3g} times as fast as the clock of this computer: set "
+                    f'time_unit = "{unit}" ({rate_hz:.4g} Hz)'
+                )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Encode each sample as one line with the configured columns and units, in full precision.

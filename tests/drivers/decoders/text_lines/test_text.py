@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -170,6 +171,33 @@ def test_time_column_gives_ticks(unit: str, text: bytes, ticks: int, modulus: in
     settings = {"columns": ("t", *AXES), "time_unit": unit}
     assert decode_bytes(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
     assert build(Settings(**settings)).timing == CounterTimedFormat(modulus, 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("configured", "step", "unit"),
+    [("s", b"10", "ms"), ("ms", b"10000", "us"), ("us", b"10", "ms"), ("ms", b"0.01", "s")],
+)
+def test_wrong_time_unit_is_noticed_by_the_arrival_times(
+    configured: Literal["s", "ms", "us"], step: bytes, unit: str
+) -> None:
+    """A board at 100 Hz. The lines that arrive after the check are rejected, and the problem names the key."""
+    decoder = build(Settings(columns=("t", "gx"), time_unit=configured))
+    blocks, step_count = [], float(step)
+    for i in range(500):
+        line = b"%r,0.1\n" % (12345.0 + i * step_count)
+        blocks += decoder.feed([Chunk(line, i * 10_000_000)])
+    assert sum(map(len, blocks)) <= 51
+    assert decoder.bad >= 449
+    assert f'set time_unit = "{unit}" (' in decoder.recent_problem
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 30.0, 1e6])
+def test_time_of_a_fast_replay_is_no_wrong_unit(speed: float) -> None:
+    decoder = build(Settings(columns=("t", "gx")))
+    lines = [b"%r,0.1\n" % (i * 0.01) for i in range(3000)]
+    blocks = [b for i, line in enumerate(lines) for b in decoder.feed([Chunk(line, round(i * 1e7 / speed))])]
+    assert sum(map(len, blocks)) == len(lines) - 1
+    assert decoder.bad == 0
 
 
 def test_counter_column_gives_ticks() -> None:
