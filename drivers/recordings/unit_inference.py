@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Times
 from drivers.recordings.column_names import KIND_OF, KINDS, UNSCALED
-from drivers.recordings.table import NO_TIME_NS
+from drivers.recordings.table import NO_TIME_NS, TIME_NS
 from drivers.units import DEGREE, G0, acceleration_factor, angular_rate_factor, time_factor
 
 MIN_MARGIN: Final = 5.0
@@ -48,6 +48,8 @@ OWN_NAME: Final = 12.0
 """Log prior of SI units for the column names of this program, whose units the documentation states."""
 OWN_TIME: Final = 16.0
 """Log prior of s for fractional times in the column ``t``."""
+MIN_POSSIBLE: Final = -8.0
+"""Log likelihood below which rates in rad/s are impossible: a bias above about 16 °/s at rest, or above full scale."""
 MAX_RATE_RAD_S: Final = 4500.0 * DEGREE
 """Angular rate beyond the full scale of MEMS gyroscopes."""
 
@@ -283,12 +285,21 @@ def _list_candidates(
     if not own:
         return dict(choices)
     si_unit = KIND_OF[members[0]].si_unit
+    is_written_by_program = names.get("t") == TIME_NS
+    may_be_degrees = _fits_gyro("deg/s", evidence) and (not is_written_by_program or _contradicts_si(evidence))
     fitting = {
         unit: prior
         for unit, prior in choices.items()
-        if kind == ACCEL.name or integers or (unit == "deg/s" and _fits_gyro(unit, evidence))
+        if kind == ACCEL.name or integers or (unit == "deg/s" and may_be_degrees)
     }
     return {**fitting, si_unit: OWN_NAME}
+
+
+def _contradicts_si(evidence: _Evidence) -> bool:
+    """Return True if the rates cannot be in rad/s: gravity turns otherwise, or not at all. Any noise is possible."""
+    rate_hz = _rate("s", evidence)
+    turn = 1.0 if evidence.rotation is None or rate_hz is None else evidence.rotation * rate_hz
+    return _score_gyro("rad/s", evidence) < MIN_POSSIBLE or abs(log(turn)) > log(3.0)
 
 
 def _fits_gyro(unit: str, evidence: _Evidence) -> bool:

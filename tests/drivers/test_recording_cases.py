@@ -14,6 +14,7 @@ from drivers.data_types import times_to_seconds
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import Recording, load_samples
 from drivers.recordings.reading_options import ReadingOptions
+from drivers.recordings.writing import save_samples
 from drivers.units import DEGREE
 
 CASES = Path(__file__).parent / "recording_cases"
@@ -177,3 +178,15 @@ def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + head + bytes(100) + b"\x89MCAP0\r\n")
     with pytest.raises(RecordingError, match=r"contains messages of ROS 1 in MCAP, .* read the bag \(.bag\)"):
         load_samples(tmp_path / "x.mcap")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_only_tables_of_other_programs_are_doubted_because_of_their_noise(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    values = 0.1 * np.random.default_rng(1).standard_normal((6000, 6))  # 0.6 °/s/√Hz, more than any MEMS gyroscope
+    values[:, 5] += 9.81
+    save_samples(path, 10_000_000 * np.arange(6000), values)
+    np.testing.assert_allclose(load_samples(path).values, values)
+    save_samples(path, np.arange(6000) / 100.0, values)
+    with pytest.raises(ConfigError, match=r"fit several: gyro in .*rad/s .*--gyro-unit"):
+        load_samples(path)
