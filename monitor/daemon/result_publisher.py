@@ -177,6 +177,8 @@ class ResultPublisher:
             return
         if pipeline.fit_kernels_run_uncompiled:
             self.schedule.postpone("refit", INTERPRETED_REFIT_S)
+        if pipeline.thermal is not None:
+            latest = replace(latest, temperature_shares=pipeline.thermal.temperature_shares)
         self.latest = latest.without_coefficients() if self.withholds_coefficients else latest
         self._refitted = True
 

@@ -1,7 +1,7 @@
 """Result types of the live estimator."""
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,8 @@ class Estimate:
         None  # coefficients after each sample since the previous estimate, if they are computed
     )
     poorly_fitted_axes: tuple[str, ...] = ()  # axes whose residuals are significantly too large
+    temperature_shares: Mapping[str, float] = field(default_factory=dict)
+    # variance share of the interval means that temperature explains, by axis; 0 without a significant dependence
 
     def without_coefficients(self) -> "Estimate":
         """Return a copy of the estimate without fitted coefficients."""

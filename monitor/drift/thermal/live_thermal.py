@@ -62,6 +62,12 @@ class LiveThermalModels:
         return [update for update in updates if np.isfinite(update.temperature_c) and update.axes]
 
     @property
+    def temperature_shares(self) -> dict[str, float]:
+        """Variance share of the interval means that temperature explains, for each axis with a model."""
+        shares = {axis: one.temperature_share for axis, one in self._axes.items()}
+        return {axis: share for axis, share in shares.items() if share is not None}
+
+    @property
     def is_selecting_model(self) -> bool:
         """Return True if a model selection is in progress on any axis."""
         return any(one.is_selecting_model for one in self._axes.values())

@@ -142,6 +142,13 @@ class OnlineThermalModel:
         return MeasuredAndPredictedMean(bias, standard_error, multi_step, one_step, name, slope, "")
 
     @property
+    def temperature_share(self) -> float | None:
+        """Variance share of the interval means that the model explains, 0 for a constant, None without a model."""
+        if self._fit is None:
+            return None
+        return 0.0 if self._fit.model.shape.is_constant else self._fit.explained
+
+    @property
     def is_selecting_model(self) -> bool:
         """Return True if a model selection is in progress."""
         return self._work is not None

@@ -103,6 +103,8 @@ LOOK_EVERY: Final = 20
 """Number of blocks after which the detector tests again whether a disturbance is constant."""
 WANDER: Final = 4.0
 """Maximum scatter of the block means, relative to the scatter expected from the noise within blocks."""
+WANDER_BESIDE_LINE: Final = 2.0
+"""Maximum scatter of the block means beside a sinusoid of constant amplitude and frequency, relative as ``WANDER``."""
 MIN_VARIANCE: Final = 1e-30
 """Variance that is assigned to a constant signal, because the logarithm of zero is not finite."""
 MIN_BLOCK_SAMPLES: Final = 4
@@ -447,7 +449,8 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 def _steady(size: int, s: MotionState) -> bool:
     """Return True if the signal has been statistically constant during the last ``REFERENCE_BLOCKS`` blocks.
 
-    The two halves of the blocks must agree, and there must be no bursts of noise and no drift of the mean.
+    The two halves of the blocks must agree, and there must be no bursts of noise and no drift of the mean. A sinusoid
+    of constant amplitude and frequency is no drift.
     """
     half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):
@@ -457,6 +460,9 @@ def _steady(size: int, s: MotionState) -> bool:
         if REFERENCE_BLOCKS - n > REFERENCE_BLOCKS // 10:
             return False
         scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / NORMAL_QUARTILE
+        scatter_without_line = (
+            _scatter_without_line(a, _median(ordered, n), s) if scatter < NEVER_AT_REST[a] else scatter
+        )
         n = _sort_recent(s, LOG_VARIANCE, a, 0, REFERENCE_BLOCKS, ordered)
         middle = _median(ordered, n)
         louder = 0
@@ -465,7 +471,7 @@ def _steady(size: int, s: MotionState) -> bool:
         if louder > REFERENCE_BLOCKS // 50:
             return False
         explained = exp(0.5 * middle) / sqrt(size) + s.open[a, STEP]
-        if scatter > WANDER * explained:
+        if scatter > WANDER * explained and scatter_without_line > WANDER_BESIDE_LINE * explained:
             return False
         for kind in range(2):
             early = _median(ordered, _sort_recent(s, kind, a, 0, half, ordered))
@@ -473,6 +479,30 @@ def _steady(size: int, s: MotionState) -> bool:
             if abs(early - late) > (0.5 * LOUDER if kind == LOG_VARIANCE else WANDER * explained):
                 return False
     return True
+
+
+@compiled
+def _scatter_without_line(a: int, middle: float, s: MotionState) -> float:
+    """Return the standard deviation of the recent block means beside a sinusoid of constant amplitude and frequency.
+
+    A sinusoid x of angular frequency ω satisfies x[k − lag] + x[k + lag] = 2 cos(ω lag) x[k]. The factor of x[k] is
+    estimated by least squares. The mean of the sinusoid is ``middle``. Blocks without enough samples are not in
+    ``recent``, so that the values around them have another lag and increase the scatter.
+    """
+    lag = REFERENCE_BLOCKS // 4
+    n, xx, xy, yy = 0, 0.0, 0.0, 0.0
+    for k in range(lag, REFERENCE_BLOCKS - lag):
+        newest = s.place[RECENT] + k
+        x = s.recent[MEAN, a, newest % REFERENCE_BLOCKS] - middle
+        y = -2.0 * middle
+        for beside in (newest - lag, newest + lag):
+            y += s.recent[MEAN, a, beside % REFERENCE_BLOCKS]
+        if x * y == x * y:
+            n, xx, xy, yy = n + 1, xx + x * x, xy + x * y, yy + y * y
+    if xx == 0.0:
+        return inf
+    factor = xy / xx
+    return sqrt(max(yy - factor * xy, 0.0) / n / (2.0 + factor * factor))
 
 
 @compiled

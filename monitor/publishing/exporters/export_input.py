@@ -7,7 +7,7 @@ the noise effects that the file cannot represent, such as a spectral line.
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
@@ -127,8 +127,11 @@ class _Coefficient(msgspec.Struct):
     lo: float | None = None
 
 
+_Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
 class _Temperature(msgspec.Struct):
-    share: float
+    share: _Share
 
 
 class _WithoutTemperature(msgspec.Struct):
@@ -158,6 +161,13 @@ class _CoefficientsMessage(msgspec.Struct):
 
     axes: dict[str, dict[str, _Coefficient]]
     rate: float | None = None
+    temperature_shares: dict[str, _Share] = msgspec.field(default_factory=dict)
+
+    def to_analysis(self) -> _Analysis:
+        """Return the coefficients of each axis, with the share of temperature if its dependence is significant."""
+        shares = {axis: share for axis, share in self.temperature_shares.items() if share > 0.0}
+        temperature = {axis: _Temperature(share) for axis, share in shares.items()}
+        return _Analysis({axis: _Axis(terms, temperature.get(axis)) for axis, terms in self.axes.items()}, self.rate)
 
 
 def from_analysis_json(json_text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
@@ -179,9 +189,10 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
         schema = msgspec.json.decode(json_text, type=_Schema).schema
         if schema.startswith("imu-monitor/coefficients/"):
             message = msgspec.json.decode(json_text, type=_CoefficientsMessage)
-            found = _Analysis({axis: _Axis(terms) for axis, terms in message.axes.items()}, message.rate)
+            found, checked = message.to_analysis(), set(message.temperature_shares)
         elif schema.startswith("imu-monitor/analyze/"):
             found = msgspec.json.decode(json_text, type=_Analysis)
+            checked = set(found.axes)
         else:
             raise ConfigError(
                 f'schema "{schema}"; an export needs "imu-monitor/analyze/1" or "imu-monitor/coefficients/1"'
@@ -213,6 +224,9 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
                 f"WARNING: {axis} follows its temperature, which explains {share:d} % of its slow variance and is part "
                 f"of {_join_letters(affected)} of {axis}"
             )
+    unchecked = [axis for axis, terms in axes.items() if axis not in checked and terms.keys() & {"B", "K"}]
+    if unchecked:
+        remarks.append(f"not checked for temperature: B and K of {', '.join(unchecked)}; no live thermal model")
     return NoiseCoefficients(axes, found.rate, source, measured=True, remarks=tuple(remarks))
 
 

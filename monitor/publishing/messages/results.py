@@ -179,12 +179,20 @@ class CoefficientsMessage(SlidingWindowMessage, frozen=True, kw_only=True, tag=t
 
     topic = topics.COEFFICIENTS
     axes: dict[str, dict[str, CoefficientValue]]
+    temperature_shares: dict[str, float] | UnsetType = UNSET
+    """Share of the slow variance that the live thermal model explains, by axis. 0 means no significant dependence. Axes
+    without a thermal model are absent."""
 
     @classmethod
     def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
         values = coefficient_values(result.coefficients, result.k_or_r)
         axes = {axis: values[i] for i, axis in measured_axes(result.curve)}
-        return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
+        shares = {axis: share for axis, share in result.temperature_shares.items() if axis in axes}
+        return {
+            "filled_s": result.curve.n / result.rate_hz,
+            "axes": axes,
+            "temperature_shares": shares or UNSET,
+        }
 
     def to_coefficients(self) -> Coefficients:
         """Convert the message to an array of the noise coefficients of all axes.

@@ -23,7 +23,8 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import Status
-from monitor.publishing.messages.results import TotalAndHadamardCurves
+from monitor.publishing import exporters
+from monitor.publishing.messages.results import CoefficientsMessage, TotalAndHadamardCurves
 from monitor.settings import loading as settings
 from monitor.settings.loading import BuiltLinkAndDecoder, Device
 from tests.support.loopback_link import LoopbackLink
@@ -664,6 +665,23 @@ def test_replay_waits_for_model_selection(monkeypatch):
     assert len(harness.output.thermals) == 39
     assert harness.worker._can_take()
     assert all(result.axes["gz"].one_step is not None for _, result in harness.output.thermals[20:])
+
+
+def test_export_of_published_coefficients_names_the_axis_that_follows_its_temperature(monkeypatch):
+    monkeypatch.setattr(device_worker, "MODEL_SELECTION_REPLAY_S", np.inf)  # the same models on any machine
+    harness = WorkerHarness(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
+    n, rng = 4000, np.random.default_rng(1)
+    temperature_c = 25.0 + np.sin(2.0 * np.pi * np.arange(n) / 1000.0)
+    values = 1e-3 * rng.standard_normal((n, 6))
+    values[:, 2] += 2e-3 * (temperature_c - 25.0)
+    harness.worker._push(make_block(np.arange(n) * 10_000_000, values, temperature_c, np.arange(n)))
+    for i in range(40):
+        harness.process(1000.0 + i)
+    unix_s, estimate = harness.output.estimates[-1]
+    message = CoefficientsMessage.from_result("a", unix_s, n, estimate)
+    remarks = exporters.from_analysis_json(message.encode()).remarks
+    assert len(remarks) == 1, remarks
+    assert remarks[0].startswith("WARNING: gz follows its temperature, which explains 9")
 
 
 def test_draining_does_not_wait_for_model_selection():

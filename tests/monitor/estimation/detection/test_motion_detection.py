@@ -255,6 +255,15 @@ def test_constant_sinusoid_is_not_motion(frequency_hz):
     assert not mask.any()
 
 
+@pytest.mark.parametrize(("frequency_hz", "size"), [(0.13, 20.0), (0.3, 10.0), (0.7, 10.0), (0.7, 50.0)])
+def test_slow_sinusoid_that_stays_is_accepted_as_rest_after_a_minute(frequency_hz, size):
+    values = simulate_rest(240)
+    values[6000:, [2, 4]] += size * NOISE[[2, 4]] * np.sin(2 * np.pi * frequency_hz / RATE * np.arange(18000))[:, None]
+    mask, motions = detect_motion(values, RATE)
+    assert mask[6000:12000].any()
+    assert not mask[14000:].any(), [motion.text for motion in motions]
+
+
 @pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
 def test_short_vibration_is_motion(seconds):
     rng = np.random.default_rng(7)
@@ -274,6 +283,19 @@ def test_continuous_motion_is_never_accepted_as_rest():
     values[6000:, :3] += 3.0 * wander[6000:, None]
     mask, _ = detect_motion(values, RATE)
     assert mask[6100:].mean() > 0.9
+
+
+@pytest.mark.parametrize(("varies", "deviation"), [("frequency", 0.035), ("amplitude", 0.2)])
+def test_irregular_oscillation_is_never_accepted_as_rest(varies, deviation):
+    values = simulate_rest(300)
+    rng = np.random.default_rng(5)
+    n = len(values) - 3000
+    factor = 1.0 + deviation * np.convolve(rng.standard_normal(n + 199), np.full(200, 200**-0.5), "valid")
+    rows = np.cumsum(factor) if varies == "frequency" else np.arange(n)
+    oscillation = 0.05 * np.sin(2 * np.pi * 0.7 / RATE * rows)
+    values[3000:, 2] += oscillation if varies == "frequency" else oscillation * factor
+    mask, _ = detect_motion(values, RATE)
+    assert mask[3100:].mean() > 0.9
 
 
 def test_constant_rate_is_accepted_as_rest_after_ten_seconds():

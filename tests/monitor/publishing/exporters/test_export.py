@@ -290,7 +290,17 @@ def test_invalid_request_is_refused(form: str, inflation: float, options: dict[s
         exporters.export(make_coefficients(), form, inflation, **options)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "imu-monitor/event/1", "axes": {}}', b"\xff\xfe"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"schema": "imu-monitor/event/1", "axes": {}}',
+        '{"schema": "imu-monitor/coefficients/1", "axes": {}, "temperature_shares": {"gx": 1e308}}',
+        b"\xff\xfe",
+    ],
+)
 def test_invalid_analysis_is_refused(text: str | bytes) -> None:
     with pytest.raises(ConfigError):
         exporters.from_analysis_json(text)
@@ -312,6 +322,24 @@ def test_temperature_dependent_axis_gives_a_warning(form: str) -> None:
         f"{mark} WARNING: gy follows its temperature, which explains 98 % of its slow variance "
         "and is part of B and K of gy"
     )
+
+
+def test_coefficients_of_a_daemon_are_marked_by_its_thermal_models() -> None:
+    """A message of an earlier revision says nothing about temperature."""
+    estimated = {"value": 1e-4, "lo": 9e-5, "hi": 1.1e-4, "status": "estimated"}
+    terms = dict.fromkeys("NBK", estimated)
+    axes = dict.fromkeys(("gx", "gy", "az"), terms)
+    message: dict[str, Any] = {"schema": "imu-monitor/coefficients/1", "rate": 100.0, "axes": axes}
+    assert exporters.from_analysis_json(json.dumps(message)).remarks == (
+        "not checked for temperature: B and K of gx, gy, az; no live thermal model",
+    )
+    message["temperature_shares"] = {"gx": 0.0, "gy": 0.987}
+    noise = exporters.from_analysis_json(json.dumps(message))
+    assert noise.remarks == (
+        "WARNING: gy follows its temperature, which explains 98 % of its slow variance and is part of B and K of gy",
+        "not checked for temperature: B and K of az; no live thermal model",
+    )
+    assert all(f"# {remark}" in exporters.export(noise, "kalibr").splitlines() for remark in noise.remarks)
 
 
 @pytest.mark.parametrize(
