@@ -236,7 +236,9 @@ def _check_interleaving(path: Path, columns: Mapping[str, Times]) -> None:
         for sensors in (2, 3, 4):
             starts = (0, (column.size - MIN_INTERLEAVED_ROWS) // 2, column.size - MIN_INTERLEAVED_ROWS)
             parts = [column[at : at + MIN_INTERLEAVED_ROWS].reshape(-1, sensors) for at in starts]
-            if all(np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() > 0.0 for part in parts):
+            with np.errstate(over="ignore", invalid="ignore"):  # corrupt rows
+                differ = [np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() > 0.0 for part in parts]
+            if all(differ):
                 raise RecordingError(
                     f"{path}: every {['second', 'third', 'fourth'][sensors - 2]} row of {axis} agrees, and the others "
                     f"differ: the rows of {sensors} sensors alternate; add a column that names the sensor, such as "

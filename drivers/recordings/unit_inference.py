@@ -13,7 +13,7 @@ import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import log, log10, sqrt
+from math import inf, isfinite, log, log10, sqrt
 from typing import Final
 
 import numpy as np
@@ -48,6 +48,7 @@ OWN_NAME: Final = 12.0
 """Log prior of SI units for the column names of this program, whose units the documentation states."""
 OWN_TIME: Final = 16.0
 """Log prior of s for fractional times in the column ``t``."""
+MAX_RATE_HZ: Final = 33_000.0
 MIN_POSSIBLE: Final = -8.0
 """Log likelihood below which rates in rad/s are impossible: a bias above about 16 °/s at rest, or above full scale."""
 MAX_RATE_RAD_S: Final = 4500.0 * DEGREE
@@ -108,7 +109,9 @@ def infer_units(
     if not unknown or n < MIN_SAMPLES:
         return result
     blocks = _split_blocks(n)
-    evidence = _collect_evidence(columns, blocks, rate_hz)
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)  # a part may contain no values
+        evidence = _collect_evidence(columns, blocks, rate_hz)
     candidates = {
         kind.name: _list_candidates(kind.name, unknown, columns, names, stated, blocks, evidence)
         for kind in (TIME, GYRO, ACCEL)
@@ -122,6 +125,7 @@ def infer_units(
         for combination, score in scores.items():
             marginal[combination[position]] = max(score, marginal.get(combination[position], -np.inf))
         likely = [unit for unit in marginal if marginal[unit] > scores[best] - MIN_MARGIN]
+        likely = likely or [best[position]]  # numbers beyond all limits fit no unit
         likely.sort(key=lambda unit: (unit != best[position], -marginal[unit]))
         result.units.update(dict.fromkeys(unknown[kind.name], best[position]))
         result.likeliest[kind.name] = best[position]
@@ -146,17 +150,14 @@ def _collect_evidence(columns: Mapping[str, Times], blocks: Sequence[slice], rat
     axes = 0 if accel is None else accel.shape[2]
     quiet = np.ones(len(blocks), np.bool_)
     gravity, gravity_sigma = None, 0.04
-    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
-        warnings.simplefilter("ignore", RuntimeWarning)  # a part may contain no values
-        if force is not None and axes == 3 and np.nanmedian(force) > 0.0:
-            gravity = float(np.nanmedian(force))
-            quiet = np.nanstd(force, axis=1) < 0.03 * gravity
-            gravity_sigma = 0.04 if np.any(quiet) else 0.35
-            if np.any(quiet):
-                gravity = float(np.nanmedian(force[quiet]))
-        gyro_sigma = None if gyro is None else _noise(gyro)
-        if gyro is not None and gyro_sigma is not None:
-            quiet &= np.all(np.nanstd(gyro, axis=1) < 2.5 * np.maximum(gyro_sigma, 1e-30), axis=1)
+    if force is not None and axes == 3 and np.nanmedian(force) > 0.0:
+        gravity = float(np.nanmedian(force))
+        quiet = np.nanstd(force, axis=1) < 0.03 * gravity
+        gravity_sigma = 0.04 if np.any(quiet) else 0.35
+        if np.any(quiet):
+            gravity = float(np.nanmedian(force[quiet]))
+    if gyro is not None:
+        quiet &= np.all(np.nanstd(gyro, axis=1) < 2.5 * np.maximum(_noise(gyro), 1e-30), axis=1)
     at_rest = bool(np.mean(quiet) >= 0.25)
     bias = None
     if at_rest and gyro is not None:
@@ -222,10 +223,8 @@ def _measure_warming(temperature: Times | None, parts: int = 8) -> float:
     if temperature is None or temperature.size < parts * MIN_SAMPLES // 2:
         return 0.0
     size = temperature.size // parts
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a part may contain no values
-        means = np.nanmedian(temperature[: parts * size].reshape(parts, size), axis=1)
-        return float(np.nanmax(np.abs(np.diff(means)), initial=0.0)) / size
+    means = np.nanmedian(temperature[: parts * size].reshape(parts, size), axis=1)
+    return float(np.nanmax(np.abs(np.diff(means)), initial=0.0)) / size
 
 
 def _measure_rotation(gyro: Floats | None, accel: Floats | None, rows: int = 32) -> float | None:
@@ -270,7 +269,9 @@ def _list_candidates(
     parts = [columns[q][block] for q in members for block in blocks]
     fractional = any(bool(np.any(np.mod(part[np.isfinite(part)], 1.0) != 0.0)) for part in parts)
     if kind == TIME.name:
-        found = dict.fromkeys(TIME_UNITS if evidence.step else ["s"], 0.0)
+        if not evidence.step or (own and 1.0 < 1.0 / evidence.step < MAX_RATE_HZ):
+            return {"s": 0.0}
+        found = dict.fromkeys(TIME_UNITS, 0.0)
         own_s = OWN_TIME if parts[0].dtype.kind == "f" else 6.0
         found["s"] = own_s if own else 3.0 if fractional else 0.0
         if evidence.constant_step and evidence.step == 1.0:
@@ -306,7 +307,7 @@ def _fits_gyro(unit: str, evidence: _Evidence) -> bool:
     """Return True if the noise and the bias at rest are those of a usual gyroscope. Numbers of any size fit rad/s."""
     noise = evidence.gyro_noise
     rates = [_rate(time, evidence) or 100.0 for time in TIME_UNITS]
-    usual = [rate_hz for rate_hz in rates if 1.0 <= rate_hz <= 33_000.0] or rates[:1]
+    usual = [rate_hz for rate_hz in rates if 1.0 <= rate_hz <= MAX_RATE_HZ] or rates[:1]
     fits = [0.0 if noise is None else _score_gyro_noise(noise * angular_rate_factor(unit), one) for one in usual]
     return _score_gyro(unit, evidence) + max(fits) > -2.0
 
@@ -329,7 +330,7 @@ def _score(candidates: Mapping[str, Mapping[str, float]], evidence: _Evidence) -
             score += 0.5 * _score_noise(evidence.accel_noise * acceleration_factor(accel), rate_hz, 1.5e-3, 0.1)
         if gyro and evidence.rotation is not None and rate_hz is not None:
             score += _normal(log(evidence.rotation * rate_hz / angular_rate_factor(gyro)), 0.3, 14.0)
-        scores[time, gyro, accel] = score
+        scores[time, gyro, accel] = score if isfinite(score) else -inf
     return scores
 
 
@@ -354,7 +355,7 @@ def _score_time(unit: str, rate_hz: float | None, evidence: _Evidence) -> float:
         return 0.0
     decades = log10(rate_hz)
     score = float(
-        np.interp(decades, (-3, -1, 0, 1, 1.4, 3.3, 4, 4.5, 5, 7), (-20, -9, -5, -0.5, 0, 0, -3, -5, -10, -20))
+        np.interp(decades, (-3, -1, 0, 1, 1.4, 3.3, 4, 4.5, 5, 7), (-10.5, -9, -5, -0.5, 0, 0, -3, -5, -10, -20))
     )
     unix_s = evidence.first_time * time_factor(unit or "s")
     warming_c_s = evidence.temperature_step_c * rate_hz

@@ -69,7 +69,7 @@ def build_model(k: dict[str, float]) -> NoiseModel:
 def replay_output(tmp_path_factory: pytest.TempPathFactory) -> HistoryOutput:
     folder: Path = tmp_path_factory.mktemp("jump")
     values = np.concatenate(
-        [build_model(BEFORE).simulate(25_000, RATE_HZ, seed=3), build_model(AFTER).simulate(35_000, RATE_HZ, seed=4)]
+        [build_model(BEFORE).simulate(25_000, RATE_HZ, seed=5), build_model(AFTER).simulate(35_000, RATE_HZ, seed=6)]
     )
     np.savez(folder / "jump.npz", fs=RATE_HZ, **dict(zip(AXES, values.T, strict=True)))
     with run_service(folder, CONFIG, output := HistoryOutput()) as run:

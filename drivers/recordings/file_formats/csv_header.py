@@ -107,8 +107,8 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
             )
         return _build_header(path, label, comments[-1], [], text, len(lines))
     first, header = _find_header_row(rows)
-    before = [line for line in comments if line.number < rows[first].number]
-    if header is None and before and _is_header_comment(before[-1].text, rows[first].text):
+    before = [line for line in comments if header is None and line.number < rows[first].number]
+    if before and _is_header_comment(before[-1].text, rows[first].text):
         header = before[-1]
     if header is None:
         return _build_numbered(label, rows[first], options, text[rows[first].begin :])
