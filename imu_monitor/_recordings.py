@@ -187,7 +187,7 @@ def read_recording(
         Unit of the times in the file, such as ``"ns"``. By default, the unit that the file states or that its numbers
         show, or s.
     assume : bool, optional
-        True to use the likeliest unit if the numbers of a table fit several units. By default, such a table is refused.
+        True to accept a doubtful table with its likeliest units and as one sensor. By default, such a table is refused.
 
     Returns
     -------

@@ -136,7 +136,7 @@ SENSOR_NAMES: Final[Mapping[str, tuple[str, int]]] = {
 TIME_NAMES: Final[Mapping[str, tuple[int, str | None]]] = {
     "seconds elapsed": (1, "s"), "time since start": (1, None), "time since start in": (1, None),
     "elapsed time": (1, None), "header stamp": (1, None), "timestamp": (2, None), "time stamp": (2, None),
-    "time": (2, None), "stamp": (2, None), "unix time": (2, None), "t": (2, None), "millis": (3, "ms"),
+    "time": (2, None), "stamp": (2, None), "ts": (2, None), "unix time": (2, None), "t": (2, None), "millis": (3, "ms"),
     "micros": (3, "us"),
 }  # fmt: skip
 """Rank and implied unit of each column name that contains times."""

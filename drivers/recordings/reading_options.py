@@ -62,7 +62,7 @@ class ReadingOptions(SettingsModel):
         examples=["ns"],
         description="unit of t in the file; absent: unit that the file states or its numbers show, or s",
     )
-    assume: bool = Field(False, description="use the likeliest unit if the units of a table are doubtful")
+    assume: bool = Field(False, description="accept a doubtful table with its likeliest units and as one sensor")
 
 
 OPTION_NAMES: Final = {key: f"--{key.replace('_', '-')}" for key in ReadingOptions.model_fields}

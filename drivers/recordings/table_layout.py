@@ -144,7 +144,7 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
     notes = list(table.notes)
     stated = table.units
     table = _select_rows_of_sensor(path, table, options)
-    if table.names:
+    if table.names and not options.assume:
         _check_interleaving(path, table.columns)
     table = _infer_units(path, table, options, notes)
     columns = {}
@@ -227,23 +227,29 @@ def _select_rows_of_sensor(path: Path, table: Table, options: ReadingOptions) ->
 def _check_interleaving(path: Path, columns: Mapping[str, Times]) -> None:
     """Raise RecordingError if the rows of several sensors alternate without a column that tells them apart.
 
-    The values of every k-th row then agree with each other, and differ from those of the other rows.
+    The values of every k-th row then agree with each other, and differ from those of the other rows. A line at the k-th
+    part of the sample rate has the same pattern. Several sensors have the pattern on several axes, or in the times.
     """
-    for axis in AXES:
-        column = columns.get(axis)
-        if column is None or column.size < 2 * MIN_INTERLEAVED_ROWS:
-            continue
-        for sensors in (2, 3, 4):
-            starts = (0, (column.size - MIN_INTERLEAVED_ROWS) // 2, column.size - MIN_INTERLEAVED_ROWS)
-            parts = [column[at : at + MIN_INTERLEAVED_ROWS].reshape(-1, sensors) for at in starts]
-            with np.errstate(over="ignore", invalid="ignore"):  # corrupt rows
-                differ = [np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() > 0.0 for part in parts]
-            if all(differ):
-                raise RecordingError(
-                    f"{path}: every {['second', 'third', 'fourth'][sensors - 2]} row of {axis} agrees, and the others "
-                    f"differ: the rows of {sensors} sensors alternate; add a column that names the sensor, such as "
-                    "imu, or write one file for each sensor"
-                )
+    measured = [columns[one] for one in AXES if one in columns and columns[one].size >= 2 * MIN_INTERLEAVED_ROWS]
+    for sensors in (2, 3, 4):
+        differing = sum(_alternates(column, sensors) for column in measured)
+        in_times = "t" in columns and _alternates(np.diff(columns["t"]), sensors)
+        if differing and (in_times or differing > max(1, len(measured) // 2)):
+            raise RecordingError(
+                f"{path}: every {['second', 'third', 'fourth'][sensors - 2]} row agrees, and the others differ: the "
+                f"rows of {sensors} sensors alternate; add a column that names the sensor, such as imu, or write one "
+                "file for each sensor. If the table contains one sensor, use --assume"
+            )
+
+
+def _alternates(column: Times, sensors: int) -> bool:
+    """Return True if the values differ between every k-th row at the start, in the middle and at the end."""
+    if column.size < MIN_INTERLEAVED_ROWS:
+        return False
+    starts = (0, (column.size - MIN_INTERLEAVED_ROWS) // 2, column.size - MIN_INTERLEAVED_ROWS)
+    parts = [column[at : at + MIN_INTERLEAVED_ROWS].reshape(-1, sensors) for at in starts]
+    with np.errstate(over="ignore", invalid="ignore"):  # corrupt rows
+        return all(np.ptp(part.mean(axis=0)) > MIN_SEPARATION * part.std(axis=0).mean() for part in parts)
 
 
 def _find_conversion(path: Path, quantity: str, unit: str) -> tuple[float, float]:

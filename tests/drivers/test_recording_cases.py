@@ -190,3 +190,17 @@ def test_only_tables_of_other_programs_are_doubted_because_of_their_noise(tmp_pa
     save_samples(path, np.arange(6000) / 100.0, values)
     with pytest.raises(ConfigError, match=r"fit several: gyro in .*rad/s .*--gyro-unit"):
         load_samples(path)
+
+
+def test_line_at_a_quarter_of_the_rate_is_one_sensor(tmp_path: Path) -> None:
+    times_s = np.arange(4000) / 100.0
+    values = 1e-3 * np.random.default_rng(3).standard_normal((4000, 6))
+    values[:, 5] += 9.81
+    values[:, 2] += 0.01 * np.sin(2.0 * np.pi * 25.0 * times_s + 0.3)
+    save_samples(tmp_path / "x.csv", times_s, values)
+    np.testing.assert_allclose(load_samples(tmp_path / "x.csv").values, values)
+    values[:, 3:] += 0.02 * np.sin(2.0 * np.pi * 25.0 * times_s + 0.3)[:, None]
+    save_samples(tmp_path / "x.csv", times_s, values)
+    with pytest.raises(RecordingError, match="fourth row agrees"):
+        load_samples(tmp_path / "x.csv")
+    assert len(load_samples(tmp_path / "x.csv", options=ReadingOptions(assume=True))) == 4000

@@ -171,7 +171,8 @@ READING_OPTIONS = {
     "temperature_unit": _text_option("UNIT", f"Unit of the temperature in the file: {', '.join(units.TEMPERATURE)}."),
     "time_unit": _text_option("UNIT", f"Unit of the times in the file: {', '.join(units.TIME)}."),
     "assume": Annotated[
-        bool | None, typer.Option("--assume", help="Use the likeliest unit if the units of a table are doubtful.")
+        bool | None,
+        typer.Option("--assume", help="Accept a doubtful table with its likeliest units and as one sensor."),
     ],
 }
 """Options that determine how a recording is read, by the field of ``ReadingOptions``."""
