@@ -16,6 +16,7 @@ import errno
 import math
 import os
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -124,14 +125,21 @@ class HistoryFileWriter:
             raise
 
     def _prepare(self) -> None:
-        if not _is_history(self._db, self.path):
-            self._db.execute("PRAGMA journal_mode = WAL")
-            with self._transaction():
-                if not _is_history(self._db, self.path):  # Another process may have created the tables in the meantime.
-                    for statement in SCHEMA.split(";"):
-                        self._db.execute(statement)
-                    self._db.execute(f"PRAGMA application_id = {APPLICATION}")
-                    self._db.execute(f"PRAGMA user_version = {VERSION}")
+        with self._transaction():
+            if not _is_history(self._db, self.path):
+                for statement in SCHEMA.split(";"):
+                    self._db.execute(statement)
+                self._db.execute(f"PRAGMA application_id = {APPLICATION}")
+                self._db.execute(f"PRAGMA user_version = {VERSION}")
+        deadline_s = time.monotonic() + BUSY_TIMEOUT_S
+        while True:  # SQLite itself does not always wait while another process opens the new file.
+            try:
+                self._db.execute("PRAGMA journal_mode = WAL")
+                break
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > deadline_s:
+                    raise
+                time.sleep(0.01)
         # Commits occur about once a minute and are flushed to disk, so a power failure loses at most one commit.
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
@@ -397,9 +405,9 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
         with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
+            db.execute("BEGIN")
             if not _is_history(db, path):
                 raise RecordingError(f"{path}: the history is still empty")
-            db.execute("BEGIN")
             yield HistoryReader(db, path)
     except sqlite3.OperationalError as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error

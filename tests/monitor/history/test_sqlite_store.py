@@ -180,6 +180,27 @@ def test_two_writers_can_use_one_file(tmp_path: Path) -> None:
     assert both.counts[0] == 2 * sum(make_row(T0, np.random.default_rng(i)).counts[0] for i in range(30))
 
 
+def test_two_writers_can_create_one_file(tmp_path: Path) -> None:
+    errors: list[Exception] = []
+
+    def create(path: Path, start: threading.Barrier) -> None:
+        start.wait()
+        try:
+            with open_writer(path):
+                pass
+        except (sqlite3.Error, RecordingError, OSError) as error:
+            errors.append(error)
+
+    for i in range(50):
+        start = threading.Barrier(2)
+        threads = [threading.Thread(target=create, args=(tmp_path / f"{i}.sqlite", start)) for _ in "ab"]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert errors == []
+
+
 # --- events
 
 
