@@ -20,7 +20,7 @@ MAX_BATCH_INTERVAL_S = 0.5
 """Time between two batches according to docs/how-to/recording.md. It is not imported, because it is the code under
 test."""
 LOAD_FACTOR = 4.0
-KILLS = 5
+KILLS = 3
 """Number of kills of daemons that have recorded for at least two seconds."""
 
 
