@@ -21,6 +21,7 @@ from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_time_gaps import FORWARD_JUMP_S
 from drivers.validation.number_ranges import RATE_HZ
 from monitor.common.unit_formatting import format_axis_value, format_two_significant_digits
+from monitor.estimation.coarse_times import refine_coarse_times
 from monitor.estimation.detection.coarse_quantization import QuantizationStepAndNoise, find_coarsely_quantized_axes
 from monitor.estimation.detection.repeated_share import estimate_stale_sample_share
 from monitor.estimation.missing_sample_count import count_missing_before_gaps
@@ -45,8 +46,6 @@ SEGMENTS: Final = 8
 """Number of segments into which a recording is divided to compute the standard error of the mean rate."""
 RATE_SIGMA: Final = 5.0
 """Minimum deviation of the rate that counts as significant, in standard errors of the mean rate."""
-UNIT_TOLERANCE: Final = 0.05
-"""Maximum deviation of a time step from a multiple of the time unit, as a fraction of the unit."""
 UNEVEN_STEP_SHARE: Final = 0.5
 """Minimum reported deviation of the 10 % and 90 % quantiles of the time steps, as a fraction of the sample period."""
 
@@ -126,6 +125,7 @@ def _resample(
 
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
+    blocks, resolution_s = refine_coarse_times(blocks)
     clock = SampleClock(SenderTimedFormat(), rate_hz)
     stamped = [one for samples in blocks for one in clock.assign_times(samples)]
     clock_notes = [event.text for event in clock.take_events(ended=True)]
@@ -139,6 +139,8 @@ def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[S
         if len(clock_notes) > MAX_CLOCK_NOTES
         else []
     )
+    if resolution_s:
+        notes.append(f"times have a resolution of {resolution_s:.3g} s; equal time steps are assumed between pauses")
     return stamped, lost, rate, notes + _step_notes(steps, progress, rate) + _late_notes(late)
 
 
@@ -253,9 +255,6 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
     alike = middle > 0.0 and high - low <= STEP_TOLERANCE * middle
     if alike or max(1.0 / rate_hz - low, high - 1.0 / rate_hz) <= UNEVEN_STEP_SHARE / rate_hz:
         return []
-    unit_s = _unit_s(steps)
-    if unit_s > UNEVEN_STEP_SHARE / rate_hz:
-        return [f"times have a resolution of {unit_s:.3g} s; equal time steps are assumed"]
     worst_s = float(steps[steps < FORWARD_JUMP_S * NS_PER_S].max()) / NS_PER_S
     return [
         f"time steps are uneven: median {middle:.3g} s, 90 % quantile {high:.3g} s, maximum {worst_s:.3g} s; "
@@ -266,17 +265,6 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
 def _is_even(steps: Ints) -> bool:
     """Return True if all time steps are equal within ``STEP_TOLERANCE``."""
     return float(steps.max()) - float(steps.min()) <= STEP_TOLERANCE * float(steps.min())
-
-
-def _unit_s(steps: Ints) -> float:
-    """Return the time unit in seconds of which all time steps are multiples, or 0 if there is none."""
-    on = steps[steps > 0]
-    if not on.size:
-        return 0.0
-    # The mean of several steps is more accurate than a single step, because time stamps are rounded to nanoseconds.
-    unit = float(on[on < 1.5 * on.min()].mean())
-    whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
-    return unit / NS_PER_S if whole.all() else 0.0
 
 
 def _count_and_time(

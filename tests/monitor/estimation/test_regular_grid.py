@@ -102,7 +102,7 @@ def test_short_or_irregular_times_contradict_no_rate(seed):
 def test_coarse_resolution_of_times_gives_a_note(unit_s, resolution):
     t = np.floor(np.arange(8000) / 5.0 / unit_s + 1e-9) * unit_s
     _, _, notes = place_on_grid(recorded_blocks(t), None)
-    assert notes == [f"times have a resolution of {resolution} s; equal time steps are assumed"]
+    assert notes == [f"times have a resolution of {resolution} s; equal time steps are assumed between pauses"]
 
 
 def test_irregular_time_steps_give_a_note():
