@@ -1,5 +1,6 @@
 """Noise models, simulated recordings, and parameter files of other programs."""
 
+from collections.abc import Sequence
 from os import PathLike, fspath
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def simulate(
 
 @errors_name_arguments()
 def export_parameters(
-    source: AllanEstimate | ModelSource,
+    source: AllanEstimate | ModelSource | Sequence[AllanEstimate],
     format: str,  # noqa: A002 - the name that users expect
     *,
     inflation: float = 1.0,
@@ -150,8 +151,9 @@ def export_parameters(
 
     Parameters
     ----------
-    source : AllanEstimate, NoiseModel, str or path-like
-        Result of ``analyze``, noise model, name of a shipped model, or path of a model file.
+    source : AllanEstimate, NoiseModel, str, path-like or sequence of AllanEstimate
+        Result of ``analyze``, noise model, name of a shipped model, path of a model file, or several results with
+        different axes.
     format : str
         Program that reads the parameters, such as "kalibr", "openvins", "px4_ekf2" (docs/reference/export.md).
     inflation : float
@@ -168,7 +170,7 @@ def export_parameters(
     ConfigError
         If the format is unknown, an argument does not apply to the format, or the model lacks a coefficient.
     NotReady
-        If the recording is too short to determine a coefficient.
+        If the recording determines none of the coefficients.
 
     Examples
     --------
@@ -177,11 +179,13 @@ def export_parameters(
     >>> print(next(line for line in text.splitlines() if line.startswith("gyroscope_noise_density")))
     gyroscope_noise_density: 7.500000e-04
     """
-    if isinstance(source, AllanEstimate):
-        noise = exporters.from_analysis_json(source._message().encode())  # noqa: SLF001 - the JSON of ``to_dict``
-    else:
+    if isinstance(source, NoiseModel | str | PathLike):
         model, name = to_model(source)
         noise = exporters.from_model(model, name)
+    else:
+        results = [source] if isinstance(source, AllanEstimate) else source
+        # the JSON of ``to_dict``
+        noise = exporters.join_sources([exporters.from_analysis_json(one._message().encode()) for one in results])  # noqa: SLF001
     return exporters.export(
         noise, format, inflation, dt_s=dt_s, correlation_time_s=correlation_time_s, rostopic=rostopic
     )

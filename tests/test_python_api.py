@@ -180,6 +180,8 @@ def test_results_are_those_of_the_commands(
     run_command("export", "result.json", "--format", "kalman", "--out", "kalman.txt")
     written = (tmp_path / "kalman.txt").read_text().splitlines()
     exported = imu_monitor.export_parameters(result, "kalman").splitlines()
+    with pytest.raises(imu_monitor.ConfigError, match="in another source too"):
+        imu_monitor.export_parameters([result, result], "kalman")
     assert [line for line in exported if "source" not in line] == [line for line in written if "source" not in line]
     run_command("reconcile", "run.npz", "--model", "mti-1", "--out", "report")
     assert imu_monitor.reconcile(read, "mti-1").to_dict() == json.loads((tmp_path / "report/report.json").read_bytes())

@@ -26,11 +26,12 @@ def export(
             "gyroparams, kalman.",
         ),
     ],
-    source: Annotated[
-        str | None,
+    sources: Annotated[
+        list[str] | None,
         typer.Argument(
             metavar="MODEL.toml|NAME|RESULT.json",
-            help="Model file, name of a shipped model, or JSON output of analyze; - = standard input.",
+            help="Model file, name of a shipped model, or JSON output of analyze; - = standard input. Several results "
+            "with different axes are joined.",
         ),
     ] = None,
     inflation: options.Inflation = 1.0,
@@ -50,10 +51,12 @@ def export(
     from monitor.publishing import exporters
 
     live = connect is not None or zenoh is not None
-    if live == (source is not None):
+    if live == bool(sources):
         raise ConfigError("give either a model or the JSON of analyze, or --connect ENDPOINT for a running daemon")
     noise = (
-        options.read_noise_coefficients(source) if source is not None else _from_daemon(connect, zenoh, prefix, device)
+        exporters.join_sources([options.read_noise_coefficients(one) for one in sources])
+        if sources
+        else _from_daemon(connect, zenoh, prefix, device)
     )
     try:
         text = exporters.export(
@@ -64,6 +67,8 @@ def export(
         raise ConfigError(f"{OPTION_NAMES.get(name, name)}{colon}{rest}") from None
     output.write_file_or_stdout("--out", out or Path("-"), text.encode())
     output.print_written_files(out)
+    for sentence in exporters.describe_weak_points(noise):
+        typer.echo(f"note: {sentence}", err=True)
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> "NoiseCoefficients":

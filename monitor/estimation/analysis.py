@@ -125,7 +125,7 @@ def analyze(
     return RecordingAnalysis(
         estimate,
         estimate.window_s,
-        (*reading_notes, *found, *said),
+        (*reading_notes, *found, *analysis_notes.describe_constant_axes(values), *said),
         values,
         fitted,
         bandwidth_hz,

@@ -52,6 +52,23 @@ MIN_DEPARTURE_RATIO: Final = 0.5
 """Minimum residual at which an averaging time is reported, relative to the largest residual of the axis."""
 
 
+def describe_constant_axes(values: Floats) -> list[str]:
+    """Describe the axes that always have the same value, such as those that a program has filled with zeros.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, 6)
+        Samples in rad/s and m/s²; NaN means missing.
+    """
+    found = []
+    for i, axis in enumerate(AXES):
+        known = ~np.isnan(values[:, i])
+        value = values[known.argmax(), i]
+        if known.any() and np.array_equal(values[:, i] == value, known):
+            found.append((axis, f"always {format_axis_value(axis, float(value))}, so no noise can be measured"))
+    return _group_axes(found)
+
+
 def describe_unexplained_curve(
     curve: AllanCurve, fit: Fit, low_passes: Sequence[LowPass | None], rate_hz: float
 ) -> list[str]:

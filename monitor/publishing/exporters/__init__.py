@@ -18,15 +18,26 @@ from monitor.publishing.exporters.estimator_parameters import PARAMETER_FILES
 from monitor.publishing.exporters.export_input import (
     AxisCoefficientOrBound,
     NoiseCoefficients,
+    describe_weak_points,
     from_analysis_json,
     from_model,
+    join_sources,
     missing_coefficient_error,
 )
 from monitor.publishing.exporters.imu_utils import export_imu_utils
 from monitor.publishing.exporters.kalman import export_kalman_process_noise
 from monitor.publishing.exporters.simulator_parameters import export_gnss_ins_sim, export_gyroparams
 
-__all__ = ["FORMATS", "AxisCoefficientOrBound", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
+__all__ = [
+    "FORMATS",
+    "AxisCoefficientOrBound",
+    "NoiseCoefficients",
+    "describe_weak_points",
+    "export",
+    "from_analysis_json",
+    "from_model",
+    "join_sources",
+]
 
 
 class Exporter(NamedTuple):
@@ -66,7 +77,7 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
         If the format is unknown, an option does not belong to the format, the inflation factor is below 1, or the noise
         model lacks a required coefficient.
     NotReady
-        If the recording is too short to determine a required coefficient.
+        If the recording determines none of the required coefficients.
     """
     if format_name not in FORMATS:
         raise ConfigError(f'unknown format "{format_name}"; possible are {", ".join(FORMATS)}')

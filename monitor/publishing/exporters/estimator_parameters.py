@@ -118,7 +118,7 @@ class ParameterFile:
     before: tuple[str, ...] = ()
     after: tuple[str, ...] = ()
     default_dt_s: float | None = None  # time step of the program; by default, the sample period
-    is_fragment: bool = False  # True if the lines replace those of a larger file, so that K may be left out
+    is_fragment: bool = False  # True if the lines replace those of a larger file, so that a model may lack K
 
     @property
     def options(self) -> frozenset[str]:
@@ -147,7 +147,7 @@ class ParameterFile:
         ConfigError
             If the sample rate is needed and unknown, or if the noise model lacks a required coefficient.
         NotReady
-            If the recording is too short to determine a required coefficient.
+            If the recording determines none of the coefficients.
         """
         step_s = self._time_step_s(noise, dt_s)
         filled = {"rate": repr(noise.sample_rate_hz), "rostopic": rostopic}
@@ -158,9 +158,11 @@ class ParameterFile:
             *(f"# {note}" for note in self.notes),
             *(text.format_map(filled) for text in self.before),
         ]
+        known = [one for one in self.parameters if noise.coefficient_by_axis(one.kind, one.letter)]
         for one in self.parameters:
-            if self.is_fragment and one.letter == "K" and not noise.coefficient_by_axis(one.kind, "K"):
-                lines.append(f"# {one.name} is left out: K of the {one.kind} axes is unknown")
+            if one not in known and known and (noise.measured or (self.is_fragment and one.letter == "K")):
+                why = "not measured" if noise.measured else "not in the model"
+                lines.append(f"# {one.name} is left out: {one.letter} of the {one.kind} axes is {why}")
             else:
                 lines += self._parameter_lines(one, noise, inflation, step_s)
         letters = {one.letter for one in self.parameters}

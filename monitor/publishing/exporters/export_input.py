@@ -5,7 +5,7 @@ the noise effects that the file cannot represent, such as a spectral line.
 """
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -228,6 +228,63 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
     if unchecked:
         remarks.append(f"not checked for temperature: B and K of {', '.join(unchecked)}; no live thermal model")
     return NoiseCoefficients(axes, found.rate, source, measured=True, remarks=tuple(remarks))
+
+
+def join_sources(sources: Sequence[NoiseCoefficients]) -> NoiseCoefficients:
+    """Join the coefficients of different axes, such as those of a gyroscope and an accelerometer recorded separately.
+
+    Parameters
+    ----------
+    sources
+        Coefficients of one or several results or models. The first one determines the sample rate.
+
+    Raises
+    ------
+    ConfigError
+        If two of them contain the same axis.
+    """
+    first, *others = sources
+    axes = dict(first.axes)
+    for one in others:
+        if both := [axis for axis in AXES if axis in axes and axis in one.axes]:
+            raise ConfigError(f"{one.source}: {', '.join(both)} in another source too; each axis may be in one only")
+        axes |= one.axes
+    remarks = [remark for one in sources for remark in one.remarks]
+    if len({one.sample_rate_hz for one in sources}) > 1:
+        rates = ", ".join(f"{one.source} {one.sample_rate_hz or math.nan:g} Hz" for one in sources)
+        remarks.append(f"the sample rates differ ({rates}); that of the first is used")
+    return NoiseCoefficients(
+        {axis: axes[axis] for axis in AXES if axis in axes},
+        first.sample_rate_hz,
+        " and ".join(one.source for one in sources),
+        tuple(dict.fromkeys(effect for one in sources for effect in one.left_out)),
+        all(one.measured for one in sources),
+        tuple(remarks),
+    )
+
+
+def describe_weak_points(noise: NoiseCoefficients) -> list[str]:
+    """Return sentences about axes that were not measured, and about upper bounds that stand for values.
+
+    The bound of K is inversely proportional to the length of a recording of white noise, and the bound of B to its
+    square root.
+    """
+    if not noise.measured:
+        return []
+    found = []
+    if absent := [axis for axis in AXES if "N" not in noise.axes.get(axis, {})]:
+        found.append(f"not measured: {', '.join(absent)}")
+    bounds = [
+        f"{letter} ({', '.join(those)})"
+        for letter in "NBK"
+        if (those := [axis for axis in noise.axes if letter in noise.axes[axis] and noise.axes[axis][letter].bound])
+    ]
+    if bounds:
+        found.append(
+            f"upper bounds instead of values: {', '.join(bounds)}; a recording 4 times as long would lower those of K "
+            "up to 4 times and those of B up to 2 times"
+        )
+    return found
 
 
 def _known_coefficients(coefficients: Mapping[str, _Coefficient]) -> dict[str, AxisCoefficientOrBound]:

@@ -49,7 +49,7 @@ def export_imu_utils(noise: NoiseCoefficients, inflation: float = 1.0, dt_s: flo
     ConfigError
         If the sample rate is unknown, or if the noise model lacks N, or both B and K, on all axes of a kind.
     NotReady
-        If the recording is too short to determine N, or both B and K.
+        If the recording determines N, and B or K, on no axis.
     """
     step_s = choose_time_step_s(noise, dt_s, "imu_utils")
     lines = [
@@ -62,12 +62,19 @@ def export_imu_utils(noise: NoiseCoefficients, inflation: float = 1.0, dt_s: flo
         "type: IMU",
         "name: imu",
     ]
-    for kind, title, prefix, unit in KINDS_IN_FILE:
-        by_axis = {
+    known = {
+        kind: {
             axis: noise.axes[axis]
             for axis in noise.coefficient_by_axis(kind, "N")
-            if "B" in noise.axes[axis] or "K" in noise.axes[axis]
+            if {"B", "K"} & noise.axes[axis].keys()
         }
+        for kind, *_ in KINDS_IN_FILE
+    }
+    for kind, title, prefix, unit in KINDS_IN_FILE:
+        by_axis = known[kind]
+        if not by_axis and noise.measured and any(known.values()):
+            lines.append(f"# {title} is left out: N, and B or K, of the {kind} axes are not measured")
+            continue
         if not by_axis:
             raise missing_coefficient_error(noise, f"imu_utils needs N and B or K above 0 on the {kind} axes")
         values = {axis: _white_noise_and_minimum(terms, inflation, step_s) for axis, terms in by_axis.items()}

@@ -1,5 +1,6 @@
 """Tests of the exports: files are read as their target program does and compared with closed forms."""
 
+import dataclasses
 import json
 import math
 import re
@@ -144,8 +145,45 @@ def test_insufficient_recording_is_refused() -> None:
     without_accelerometers = exporters.NoiseCoefficients(
         {"gx": make_analysis_coefficients().axes["gx"]}, 100.0, "", measured=True
     )
-    with pytest.raises(NotReady, match="accel axes"):
-        exporters.export(without_accelerometers, "kalibr")
+    with pytest.raises(NotReady, match="a longer recording is needed"):
+        exporters.export(dataclasses.replace(without_accelerometers, axes={"gx": {}}), "kalibr")
+
+
+GYRO_RESULT = """{"schema": "imu-monitor/analyze/1", "rate": %s, "axes": {"%s": {"coefficients": {
+    "N": {"value": %s, "lo": 1.9e-4, "hi": 2.1e-4, "status": "estimated"},
+    "K": {"value": null, "lo": null, "hi": 3e-6, "status": "upper_bound"}}}}}"""
+
+
+@pytest.mark.parametrize("form", list(exporters.FORMATS))
+def test_missing_accelerometer_is_marked(form: str) -> None:
+    noise = exporters.from_analysis_json(GYRO_RESULT % (100.0, "gx", 2e-4))
+    text = exporters.export(noise, form)
+    per_axis = form in ("gnss_ins_sim", "gyroparams", "kalman")
+    assert per_axis or re.search(r"# \S+ is left out: N(, and B or K,)? of the accel axes (is|are) not measured", text)
+    assert not re.search(r"\b(nan|None)\b", text)
+    assert exporters.describe_weak_points(noise)[0] == "not measured: gy, gz, ax, ay, az"
+
+
+def test_results_of_separate_recordings_are_joined() -> None:
+    gyro, accel = (
+        exporters.from_analysis_json(GYRO_RESULT % values, source)
+        for values, source in (((400.0, "gx", 2e-4), "gyro.json"), ((250.0, "az", 3e-4), "accel.json"))
+    )
+    text = exporters.export(exporters.join_sources([gyro, accel]), "kalibr")
+    found = parse_yaml(text)
+    assert found["update_rate"] == 400.0
+    assert found["gyroscope_noise_density"] == pytest.approx(2e-4)
+    assert found["accelerometer_noise_density"] == pytest.approx(3e-4)
+    assert "# source: gyro.json and accel.json" in text
+    assert "# the sample rates differ (gyro.json 400 Hz, accel.json 250 Hz); that of the first is used" in text
+    with pytest.raises(ConfigError, match=r"accel\.json: az in another source too"):
+        exporters.join_sources([accel, gyro, accel])
+
+
+def test_bounds_are_named_with_the_gain_of_a_longer_recording() -> None:
+    noise = exporters.from_analysis_json(GYRO_RESULT % (100.0, "gx", 2e-4))
+    assert exporters.describe_weak_points(noise)[1].startswith("upper bounds instead of values: K (gx); a recording 4 ")
+    assert exporters.describe_weak_points(make_coefficients(MODEL)) == []
 
 
 def parse_matlab_properties(text: str) -> dict[str, dict[str, Any]]:
