@@ -248,14 +248,17 @@ def _probe_server(s: Settings) -> None:
 
 
 def _filter_for_address(address: int) -> dict[str, Any]:
-    extended = bool(address & EXTENDED_ID)
-    mask = ID_MASK if extended else 0x7FF
+    mask = identifier_mask(address)
+    return {"can_id": address & mask, "can_mask": mask, "extended": bool(address & EXTENDED_ID)}
+
+
+def identifier_mask(address: int) -> int:
+    """Return the bits of the CAN identifier that a frame has in common with an address of a decoder."""
     if address & ANY_SOURCE:
         # SAE J1939-21: if the PDU format is below 240, the PDU-specific byte is a destination and not part of the
         # group.
-        broadcast = (address >> 16 & 0xFF) >= 240
-        mask = 0x03FF_FF00 if broadcast else 0x03FF_0000
-    return {"can_id": address & mask, "can_mask": mask, "extended": extended}
+        return 0x03FF_FF00 if (address >> 16 & 0xFF) >= 240 else 0x03FF_0000
+    return ID_MASK if address & EXTENDED_ID else 0x7FF
 
 
 def _why_not_open(s: Settings, error: Exception) -> str:

@@ -9,13 +9,14 @@ import csv
 import io
 import re
 import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import IO, Any, BinaryIO, Final, cast
 
 import can
 from can.io import blf
 
 from drivers.data_types import EXTENDED_ID, Chunk
+from drivers.links.can_link import identifier_mask
 from drivers.recordings.table import T_LIMIT_S
 
 _SCREEN_LINE: Final = re.compile(
@@ -60,6 +61,9 @@ TEXT_READERS: Final[dict[str, type[can.io.generic.TextIOMessageReader]]] = {
 MAX_STANDARD_ID: Final = 0x7FF
 MAX_EXTENDED_ID: Final = 0x1FFF_FFFF
 MAX_FRAME_BYTES: Final = 64  # maximum payload of CAN FD
+MAX_NAMED_CHANNELS: Final = 16
+MAX_ADDRESSES: Final = 4096
+"""Maximum number of addresses whose channel is remembered."""
 READ_BYTES: Final = 4096
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
@@ -71,8 +75,61 @@ BLF_OBJECT: Final = b"LOBJ"
 BLF_HEADER_BYTES: Final = blf.OBJ_HEADER_BASE_STRUCT.size
 
 
-def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterator[Chunk]:
-    """Yield the CAN data frames of a log file in a format of python-can.
+class ChannelChoiceError(ValueError):
+    """The channel has to be chosen, or the chosen channel does not occur."""
+
+
+def choose_frames(
+    frames: Iterator[tuple[str, Chunk]], channel: str | None, addresses: Sequence[int]
+) -> Iterator[Chunk]:
+    """Yield the frames of one channel that the decoder accepts.
+
+    Parameters
+    ----------
+    frames
+        Channel and frame.
+    channel
+        Channel to read. None reads all channels, which must have different addresses.
+    addresses
+        Addresses that the decoder accepts. An empty sequence accepts all.
+
+    Raises
+    ------
+    ChannelChoiceError
+        If frames with one of the addresses come from several channels, such as those of two sensors of the same type,
+        or if no frame comes from the chosen channel.
+    """
+    wanted = [(one & (identifier_mask(one) | EXTENDED_ID), identifier_mask(one) | EXTENDED_ID) for one in addresses]
+    channels: dict[int, str] = {}
+    others: set[str] = set()
+    found = False
+    for name, chunk in frames:
+        if channel is not None and name != channel:
+            if len(others) < MAX_NAMED_CHANNELS:
+                others.add(name)
+            continue
+        found = True
+        kind = next(
+            (value for value, mask in wanted if chunk.address & mask == value), None if wanted else chunk.address
+        )
+        if kind is None:
+            continue
+        if channel is None and (len(channels) < MAX_ADDRESSES or kind in channels):
+            first = channels.setdefault(kind, name)
+            if name != first:
+                raise ChannelChoiceError(
+                    f"frames 0x{chunk.address & ~EXTENDED_ID:X} of several channels, {first} and {name}, which may be "
+                    f'several sensors; choose a channel: channel = "{first}" (--option channel={first})'
+                )
+        yield chunk
+    if channel is not None and not found:
+        raise ChannelChoiceError(
+            f"no frame of the channel {channel}; the channels are {', '.join(sorted(others)) or 'none'}"
+        )
+
+
+def read_can_log(stream: IO[bytes], suffix: str) -> Iterator[tuple[str, Chunk]]:
+    """Yield the channel and the content of the CAN data frames of a log file in a format of python-can.
 
     Parameters
     ----------
@@ -80,8 +137,6 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
         Decompressed content of the log.
     suffix
         File suffix of the format: ".blf" or a key of TEXT_READERS.
-    channel
-        Channel to read. None reads all channels.
 
     Raises
     ------
@@ -91,27 +146,23 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
     try:
         if suffix == ".blf":
             reader = _ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
-            yield from _data_frames(iter(reader), channel, lambda: None)
+            yield from _data_frames(iter(reader), lambda: None)
         else:
             lines = _BoundedLineReader(stream)
-            yield from _data_frames(
-                iter(TEXT_READERS[suffix](lines.open_as_text(None))), channel, lines.reset_bytes_since_frame
-            )
+            yield from _data_frames(iter(TEXT_READERS[suffix](lines.open_as_text(None))), lines.reset_bytes_since_frame)
     except blf.BLFParseError as error:
         raise ValueError(f"no BLF log: {error}") from error
 
 
-def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
-    """Yield the CAN data frames of a CSV file with the columns t (s), id_hex and data_hex.
+def read_hex_csv(stream: IO[bytes]) -> Iterator[tuple[str, Chunk]]:
+    """Yield the channel and the content of the CAN data frames of a CSV file with the columns t, id_hex and data_hex.
 
-    The columns ``channel`` (or ``bus``) and ``extended`` (0 or 1) are optional.
+    The times t are in s. The columns ``channel`` (or ``bus``) and ``extended`` (0 or 1) are optional.
 
     Parameters
     ----------
     stream
         Decompressed content of the file.
-    channel
-        Channel to read. None reads all channels.
 
     Raises
     ------
@@ -128,24 +179,22 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
         if len(row) != len(columns):
             raise ValueError(f"line {rows.line_num} has {len(row)} fields, not {len(columns)}")
         lines.reset_bytes_since_frame()
-        if channel is not None and (channel_column is None or row[channel_column] != channel):
-            continue
         address = int(row[identifier], 16)
         is_extended = address > MAX_STANDARD_ID if extended is None else row[extended] == "1"
-        yield _frame_chunk(bytes.fromhex(row[data]), float(row[t]), address | (EXTENDED_ID if is_extended else 0))
+        chunk = _frame_chunk(bytes.fromhex(row[data]), float(row[t]), address | (EXTENDED_ID if is_extended else 0))
+        yield "" if channel_column is None else row[channel_column], chunk
 
 
 def _data_frames(
-    messages: Iterator[can.Message], channel: str | None, reset_bytes_since_frame: Callable[[], None]
-) -> Iterator[Chunk]:
-    """Yield the data frames of one channel, and call ``reset_bytes_since_frame`` for each message of any channel."""
+    messages: Iterator[can.Message], reset_bytes_since_frame: Callable[[], None]
+) -> Iterator[tuple[str, Chunk]]:
+    """Yield the channel and the content of the data frames, and call ``reset_bytes_since_frame`` for each message."""
     for message in messages:
         reset_bytes_since_frame()
         if message.is_error_frame or message.is_remote_frame:
             continue
-        if channel is None or str(message.channel) == channel:
-            address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
-            yield _frame_chunk(bytes(message.data), message.timestamp, address)
+        address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
+        yield str(message.channel), _frame_chunk(bytes(message.data), message.timestamp, address)
 
 
 def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:

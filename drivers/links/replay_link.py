@@ -26,7 +26,8 @@ import io
 import struct
 import time
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import IO, Annotated, Any, Final, Literal, cast
 
@@ -49,6 +50,8 @@ from drivers.zenoh.sample_message import encode_samples
 DEFAULT_DECODER: Final = "samples"
 CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
+FRAMES_READ_AHEAD: Final = 2000
+"""Number of frames of a CAN log that are examined before the first of them is replayed."""
 BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
 """Total number of bytes after which a read ends. A read also ends after BATCH_CHUNKS chunks.
@@ -96,7 +99,9 @@ class Settings(LinkSettings, ReadingOptions):
         description="captured bytes per second, a tenth of the baud rate; absent: as fast as they are read",
     )
     channel: str | None = Field(
-        None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"
+        None,
+        examples=["1"],
+        description="channel of a CAN log that is replayed; absent: all, if they have different addresses",
     )
 
 
@@ -116,6 +121,11 @@ class ReplayLink(PolledLink):
         self._items: Generator[TimedChunk] | None = None  # remaining chunks; closing the generator closes the file
         self._next: TimedChunk | None = None
         self._started_s = 0.0
+        self._addresses: Sequence[int] = ()
+
+    def set_address_filter(self, addresses: Sequence[int]) -> None:
+        """Replay only the frames of a CAN log with these addresses. An empty sequence means all frames."""
+        self._addresses = addresses
 
     def _is_open(self) -> bool:
         return self._items is not None
@@ -174,7 +184,7 @@ class ReplayLink(PolledLink):
             chunks = (chunk for path in _raw_segments(self._path) for chunk in segment_file.read_chunks(path))
             return _relative_times(chunks)
         if self._kind == "log":
-            return _relative_times(_read_log(self._path, self._settings.channel))
+            return _relative_times(_read_log(self._path, self._settings.channel, self._addresses))
         return _read_capture(self._path, self._settings.bytes_per_second)
 
     def _message_rows(self, recording: Recording) -> int:
@@ -204,15 +214,28 @@ def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
         yield (chunk.t_ns - start_ns) * 1e-9, chunk
 
 
-def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
+def _read_log(path: Path, channel: str | None, addresses: Sequence[int]) -> Iterator[Chunk]:
     from drivers.links import can_log_reader
 
     suffix = _plain_suffix(path)
     with _open_binary(path) as stream:
         if suffix == ".csv" and not _read_header(path).startswith(PYTHON_CAN_HEADER):
-            yield from can_log_reader.read_hex_csv(stream, channel)
+            frames = can_log_reader.read_hex_csv(stream)
         else:
-            yield from can_log_reader.read_can_log(stream, suffix, channel)
+            frames = can_log_reader.read_can_log(stream, suffix)
+        chosen = can_log_reader.choose_frames(frames, channel, addresses)
+        head: list[Chunk] = []  # frames of two sensors are found before any of them is passed on
+        damage: Exception | None = None
+        try:
+            head.extend(islice(chosen, FRAMES_READ_AHEAD))
+        except can_log_reader.ChannelChoiceError:
+            raise
+        except (ValueError, *DAMAGE_ERRORS) as error:
+            damage = error
+        yield from head
+        if damage is not None:
+            raise damage
+        yield from chosen
 
 
 # --- raw bytes -------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import can
 import numpy as np
 import pytest
 
-from drivers.data_types import EXTENDED_ID, Chunk, concatenate_blocks
+from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
 from drivers.links import base, replay_link
@@ -174,6 +174,45 @@ def test_screen_text_of_candump_is_replayed(tmp_path: Path, flags: str, end: str
         (identifier | (EXTENDED_ID if extended else 0), data) for identifier, extended, data in FRAMES
     ]
     assert np.diff([c.t_ns for c in chunks]) == pytest.approx(np.full(len(FRAMES) - 1, 1e7), abs=2e5)
+
+
+IMU_ADDRESSES = [0x100, 0x0CF02AFE | EXTENDED_ID | ANY_SOURCE]
+
+
+@pytest.mark.parametrize(("own", "other"), [("100", "100"), ("0CF02AE2", "0CF02A11")])
+def test_sensors_on_two_buses_are_not_mixed(tmp_path: Path, own: str, other: str) -> None:
+    path = tmp_path / "drive.log"
+    rows = [f"({i / 100:.6f}) {bus} {name}#00\n" for i in range(9) for bus, name in (("can0", own), ("can1", other))]
+    path.write_text("".join(rows))
+    link = build(path)
+    link.set_address_filter(IMU_ADDRESSES)
+    with pytest.raises(LinkUnavailable, match=r"several channels, can0 and can1, .*--option channel=can0"):
+        link.open()
+    for channel in ("can0", "can1"):
+        chosen = build(path, channel=channel)
+        chosen.set_address_filter(IMU_ADDRESSES)
+        assert len(read_all(chosen)[0]) == 9
+    absent = build(path, channel="can2")
+    with pytest.raises(LinkUnavailable, match=r"no frame of the channel can2; the channels are can0, can1"):
+        absent.open()
+
+
+def test_one_sensor_beside_equal_addresses_of_other_devices(tmp_path: Path) -> None:
+    """The sensor has two messages on two buses, and both buses carry a message 555 of something else."""
+    path = tmp_path / "drive.log"
+    frames = (("can0", "100"), ("can0", "555"), ("can1", "555"), ("can1", "0CF02AE2"))
+    path.write_text("".join(f"({i / 100:.6f}) {bus} {name}#00\n" for i in range(9) for bus, name in frames))
+    link = build(path)
+    link.set_address_filter(IMU_ADDRESSES)
+    assert {chunk.address for chunk in read_all(link)[0]} == {0x100, 0x0CF02AE2 | EXTENDED_ID}
+
+
+def test_frames_before_damage_are_replayed(tmp_path: Path) -> None:
+    path = tmp_path / "drive.log"
+    path.write_text("(0.0) can0 100#00\n(0.1) can0 100#01\n(0.2) can0 1#zz\n")
+    chunks, end = read_all(build(path))
+    assert [chunk.data for chunk in chunks] == [b"\x00", b"\x01"]
+    assert "cut off or damaged" in str(end)
 
 
 def write_frames(path: Path) -> None:
