@@ -168,7 +168,7 @@ class ArrivalTimeline:
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
         t_ns: Ints = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
-        if t_ns[0] < self.last_t_ns + 2 or (t_ns[1:] < t_ns[:-1] + 2).any():
+        if t_ns[0] < self.last_t_ns + 2 or (t_ns.size > 1 and (t_ns[1:] < t_ns[:-1] + 2).any()):
             # The line has moved backwards, or float64 is too coarse. Keep the sample times increasing by at least 2 ns,
             # so that they also increase after rounding on a clock that is slewed.
             order = 2 * np.arange(len(samples))
@@ -355,7 +355,7 @@ def split_by_arrival_time(samples: SampleBlock, origin_ns: int) -> Iterator[Samp
         Arrival time of the first sample of the device in ns.
     """
     t_ns = samples.t_ns
-    if (t_ns == t_ns[:1]).all():  # usually, the samples of a chunk arrive together
+    if t_ns.size == 1 or (t_ns == t_ns[0]).all():  # usually, the samples of a chunk arrive together
         yield samples
         return
     batch = np.where(t_ns - origin_ns < SINGLE_NS, t_ns, t_ns // BATCH_NS)
@@ -376,7 +376,7 @@ def retime_and_split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) ->
     missing : array of int64, shape (n,)
         Number of missing samples before each sample.
     """
-    if not missing[1:].any():
+    if missing.size == 1 or not missing[1:].any():
         return [samples.with_times(t_ns, int(missing[0]))]
     edges = [0, *(np.flatnonzero(missing[1:]) + 1).tolist(), len(samples)]
     parts = ((a, samples[a:b]) for a, b in pairwise(edges))

@@ -274,7 +274,8 @@ class SampleClock:
             return self._sender.split_at_missing_samples(samples)
         timeline = self._timeline
         # A counter needs the whole block, which shows its typical step.
-        by_arrival = self._arrivals_are_timed and samples.ticks[0] == NO_TICK and (samples.ticks == NO_TICK).all()
+        by_arrival = self._arrivals_are_timed and samples.ticks[0] == NO_TICK
+        by_arrival = by_arrival and (len(samples) == 1 or (samples.ticks == NO_TICK).all())
         batches: Iterable[SampleBlock] = [samples]
         if by_arrival:
             batches = split_by_arrival_time(samples, timeline.origin_ns or 0)
