@@ -14,6 +14,7 @@ from drivers.recordings import ReadingOptions, load_samples, memory_check, save_
 from tests.support.recordings import float32_noise, load_damaged, load_refused, recordings
 from tests.support.ulog import (
     UlogTopic,
+    batches,
     message,
     one_sensor,
     rows_of,
@@ -82,6 +83,33 @@ class TestSamples:
         alone = load_samples(path, options=ReadingOptions(topic="sensor_gyro"))
         assert alone.axes == GYROS
         assert set(alone.temperature_c) == {40.0}
+
+    def test_batches_become_samples(self, tmp_path: Path) -> None:
+        rng, n = np.random.default_rng(3), 8000
+        t_us = 5_000_000 + 125 * np.arange(n)
+        gyro, accel = rng.integers(-300, 300, (2, n, 3))
+        scales = (0.0010652644, 0.0047884033)
+        path = write_ulog(
+            tmp_path / "x.ulg",
+            batches("sensor_gyro_fifo", t_us, gyro, scales[0]),
+            batches("sensor_accel_fifo", t_us, accel, scales[1]),
+        )
+        found = load_samples(path)
+        assert len(found) > 7900
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == (1000 * t_us[: len(found)]).tolist()
+        wanted = np.concatenate([gyro * scales[0], accel * scales[1]], axis=1)[: len(found)]
+        np.testing.assert_allclose(found.values, wanted, rtol=1e-6)
+        assert found.notes == ()
+
+    def test_batches_of_different_rates(self, tmp_path: Path) -> None:
+        counts = np.random.default_rng(3).integers(-300, 300, (8000, 3))
+        gyro = batches("sensor_gyro_fifo", 5_000_000 + 125 * np.arange(8000), counts, 1e-3)
+        accel = batches("sensor_accel_fifo", 5_000_000 + 250 * np.arange(4000), counts[:4000], 1e-3)
+        path = write_ulog(tmp_path / "x.ulg", gyro, accel)
+        assert "mixed rates: sensor_gyro_fifo 8000 Hz and sensor_accel_fifo 4000 Hz" in load_refused(path)
+        alone = load_samples(path, options=ReadingOptions(topic="sensor_gyro_fifo"))
+        assert alone.axes == GYROS
 
     def test_messages_without_a_new_acceleration(self, tmp_path: Path) -> None:
         topic = sensor_combined(times_us(10), float32_noise(10))
@@ -166,8 +194,9 @@ class TestDamage:
     ) -> None:
         t_us, rng = times_us(40), np.random.default_rng(5)
         gyro = one_sensor("sensor_gyro", t_us, float32_noise(40)[:, :3], 40.0)
-        data = ulog_bytes([sensor_combined(t_us, float32_noise(40)), gyro])
-        for _ in range(300):
+        raw = batches("sensor_gyro_fifo", t_us, rng.integers(-9, 9, (40, 3)), 1e-3)
+        kinds = ([sensor_combined(t_us, float32_noise(40)), gyro], [raw])
+        for data in (ulog_bytes(topics) for topics in kinds for _ in range(150)):
             damaged = bytearray(data)
             for at in rng.integers(0, len(data), 3):
                 damaged[at] = rng.integers(256)

@@ -9,7 +9,15 @@ from typing import Any, Final
 import numpy as np
 
 MAGIC: Final = b"ULog\x01\x12\x35\x01"
-TYPES: Final = {"f4": "float", "u8": "uint64_t", "u4": "uint32_t", "u2": "uint16_t", "i4": "int32_t"}
+TYPES: Final = {
+    "f4": "float",
+    "u8": "uint64_t",
+    "u4": "uint32_t",
+    "u2": "uint16_t",
+    "u1": "uint8_t",
+    "i4": "int32_t",
+    "i2": "int16_t",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,4 +110,32 @@ def one_sensor(
     warm = np.full(len(t_us), temperature_c, "<f4")
     return UlogTopic(
         name, rows_of(t_us, timestamp_sample=t_us.astype("<u8"), x=x, y=y, z=z, temperature=warm), instance
+    )
+
+
+def batches(name: str, t_us: np.ndarray[Any, Any], counts: np.ndarray[Any, Any], scale: float) -> UlogTopic:
+    """Return the topic ``sensor_gyro_fifo`` or ``sensor_accel_fifo`` of counts [n, 3] in batches of 7 and 8 samples.
+
+    The bytes after the last sample of a batch are those of an earlier batch.
+    """
+    sizes = np.resize([7, 8], len(counts) // 7)
+    ends = np.cumsum(sizes)
+    ends = ends[ends <= len(counts)]
+    sizes = sizes[: len(ends)]
+    xyz = np.full((len(ends), 3, 32), 12_345, "<i2")
+    for batch, (end, size) in enumerate(zip(ends, sizes, strict=True)):
+        xyz[batch, :, :size] = counts[end - size : end].T
+    newest = t_us[ends - 1]
+    return UlogTopic(
+        name,
+        rows_of(
+            newest + 200,
+            timestamp_sample=newest.astype("<u8"),
+            dt=np.full(len(ends), t_us[1] - t_us[0], "<f4"),
+            scale=np.full(len(ends), scale, "<f4"),
+            samples=sizes.astype("u1"),
+            x=xyz[:, 0],
+            y=xyz[:, 1],
+            z=xyz[:, 2],
+        ),
     )

@@ -6,6 +6,8 @@ The layout of a message is part of the log. These topics contain samples of an I
 - ``vehicle_imu``: integrals of the angular rate and of the acceleration, which are divided by the integration time;
   ``vehicle_imu_status`` contains the temperature in °C
 - ``sensor_gyro`` and ``sensor_accel``: the sensors in rad/s and m/s², with the temperature in °C
+- ``sensor_gyro_fifo`` and ``sensor_accel_fifo``: batches of up to 32 unfiltered samples in counts, at the rate of the
+  sensor (SDLOG_PROFILE: raw FIFO high-rate IMU)
 
 An autopilot with several IMUs has several instances of a topic, such as ``sensor_gyro:1``.
 
@@ -19,7 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Times
+from drivers.data_types import AXES, Ints, Times
 from drivers.errors import RecordingError, convert_library_errors
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
@@ -38,13 +40,20 @@ FIELDS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "sensor_gyro": {**dict(zip(AXES[:3], _XYZ, strict=True)), "temperature": "temperature"},
     "sensor_accel": {**dict(zip(AXES[3:], _XYZ, strict=True)), "temperature": "temperature"},
+    "sensor_gyro_fifo": dict(zip(AXES[:3], _XYZ, strict=True)),
+    "sensor_accel_fifo": dict(zip(AXES[3:], _XYZ, strict=True)),
     "vehicle_imu_status": {"temperature": "temperature_gyro"},
 }
-"""For each topic: the field that contains each column of a recording."""
+"""For each topic: the field that contains each column of a recording. The fields of a batch are arrays."""
+BATCHES: Final = ("sensor_gyro_fifo", "sensor_accel_fifo")
+BATCH_SIZE: Final = 32
+"""Maximum number of samples in a batch (SensorGyroFifo.msg)."""
 TIMES: Final = ("timestamp_sample", "timestamp")
 """Fields that contain the time since the start of the autopilot in µs. The first field is the time of the sample."""
 US_NS: Final = 1000
 """One microsecond in ns."""
+MAX_AGE_NS: Final = 1e9
+"""Maximum age of a sample in a batch. A higher age is that of a damaged message."""
 INTEGRATION_TIMES: Final = {"delta_angle": ("delta_angle_dt", "dt"), "delta_velocity": ("delta_velocity_dt", "dt")}
 """For each integral: the fields that contain the integration time in µs, in new and in old logs."""
 ACCEL_TIME: Final = "accelerometer_timestamp_relative"
@@ -78,7 +87,7 @@ def read_ulog(path: Path, topic: str | None) -> table.Table:
     log = _load(path, limit)
     data = _data_by_topic(log)
     names = _select(path, data, topic, notes)
-    limit.check_row_count(max(one.data[TIMES[-1]].size for one in map(data.__getitem__, names)))
+    limit.check_row_count(max(map(_count_rows, map(data.__getitem__, names))))
     if log.file_corruption:
         notes.append("Parts of the log are damaged and were left out.")
     if log.dropouts:
@@ -142,9 +151,7 @@ def _data_by_topic(log: Any) -> dict[str, Any]:
 
 def _select(path: Path, data: Mapping[str, Any], topic: str | None, notes: list[str]) -> list[str]:
     """Return the names of the topics to read. The status of ``vehicle_imu`` adds the temperature."""
-    topics = [
-        RecordedTopic(name, one.name, _known_columns(one), one.data[TIMES[-1]].size) for name, one in data.items()
-    ]
+    topics = [RecordedTopic(name, one.name, _known_columns(one), _count_rows(one)) for name, one in data.items()]
     names = select_topics(path, topics, _list_imus(data), topic, EXPECTED, notes)
     status = names[0].replace("vehicle_imu", "vehicle_imu_status")
     if len(names) == 1 and data[names[0]].name == "vehicle_imu" and status in data:
@@ -153,17 +160,29 @@ def _select(path: Path, data: Mapping[str, Any], topic: str | None, notes: list[
 
 
 def _known_columns(data: Any) -> tuple[str, ...]:
+    if data.name in BATCHES:
+        batch = {"samples", "dt", "scale", *(f"{field}[{i}]" for field in _XYZ for i in range(BATCH_SIZE))}
+        return tuple(FIELDS[data.name]) if batch <= data.data.keys() else ()
     return tuple(column for column, field in FIELDS[data.name].items() if field in data.data)
+
+
+def _count_rows(data: Any) -> int:
+    if data.name in BATCHES and _known_columns(data):
+        return int(np.minimum(data.data["samples"], BATCH_SIZE).sum())
+    return int(data.data[TIMES[-1]].size)
 
 
 def _list_imus(data: Mapping[str, Any]) -> Sequence[Sequence[str]]:
     """Return the IMUs of a log, grouped by topic. A gyroscope and an accelerometer with the same number form an IMU."""
     groups = [[name for name, one in data.items() if one.name == kind] for kind in FIELDS]
-    combined, integrated, gyros, accels, _ = groups
-    pairs = [
-        f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if data[gyro].multi_id == data[accel].multi_id
-    ]
-    return [group for group in (combined, integrated, *([pairs] if pairs else [gyros, accels])) if group]
+    combined, integrated, *separate = groups[:-1]
+    found = [combined, integrated]
+    for gyros, accels in zip(separate[::2], separate[1::2], strict=True):
+        pairs = [
+            f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if data[gyro].multi_id == data[accel].multi_id
+        ]
+        found += [pairs] if pairs else [gyros, accels]
+    return [group for group in found if group]
 
 
 # --- messages ------------------------------------------------------------------------------------
@@ -173,6 +192,8 @@ def _read_columns(data: Any) -> dict[str, Times]:
     """Return the columns of a topic in SI units, with the times in ns."""
     fields = data.data
     times = next(fields[name] for name in TIMES if name in fields and (name == TIMES[-1] or np.all(fields[name] > 0)))
+    if data.name in BATCHES:
+        return _read_batches(data, table.integers_to_ns(times, US_NS))
     columns: dict[str, Times] = {table.TIME_NS: table.integers_to_ns(times, US_NS)}
     for column in _known_columns(data):
         field = FIELDS[data.name][column]
@@ -186,4 +207,19 @@ def _read_columns(data: Any) -> dict[str, Times]:
     if ACCEL_TIME in fields:
         for axis in set(AXES[3:]) & columns.keys():
             columns[axis][fields[ACCEL_TIME] == INVALID_ACCEL_TIME] = np.nan
+    return columns
+
+
+def _read_batches(data: Any, t_ns: Ints) -> dict[str, Times]:
+    """Return the columns of batches. ``t_ns`` [n] are the times of the newest sample of each batch."""
+    fields = data.data
+    counts = np.minimum(fields["samples"].astype(np.int64), BATCH_SIZE)
+    used = np.arange(BATCH_SIZE) < counts[:, None]
+    with np.errstate(invalid="ignore"):  # a damaged log may contain NaN or infinity
+        age_ns = np.rint(1e3 * fields["dt"].astype(np.float64))[:, None] * (counts[:, None] - 1 - np.arange(BATCH_SIZE))
+        age_ns = np.where(np.abs(age_ns) < MAX_AGE_NS, age_ns, 0.0).astype(np.int64)
+        scale = fields["scale"].astype(np.float64)[:, None]
+        columns: dict[str, Times] = {table.TIME_NS: (t_ns[:, None] - age_ns)[used]}
+        for column, field in FIELDS[data.name].items():
+            columns[column] = (np.stack([fields[f"{field}[{i}]"] for i in range(BATCH_SIZE)], axis=1) * scale)[used]
     return columns
