@@ -291,8 +291,8 @@ def print_reconcile(records: int, seed: int) -> None:
                 sizes[name][k, record] = found[0] if len(found) == 1 else np.nan
     names = ("N", "cutoff", "Q", "line", "resonance", "correlated noise")
     print(f"| loss | true model agrees, of {AXES * -(-records // AXES)} | {' | '.join(names)} |\n| {'--- | ' * 8}")
-    for name, found in sizes.items():
-        ratio = found / sizes["none"] - 1.0
+    for name, fitted in sizes.items():
+        ratio = fitted / sizes["none"] - 1.0
         cells = [
             f"{count}: {100.0 * np.nanmean(one):+.2f} ({100.0 * np.nanmin(one):+.2f} … {100.0 * np.nanmax(one):+.2f})"
             for count, one in zip(explained[name], ratio, strict=True)
