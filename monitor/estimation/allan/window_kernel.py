@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled, inlined, without_reference_count
+from monitor.common.compiled import compiled, inlined, int_to_float, without_reference_count
 from monitor.estimation.allan.missing_samples import MIN_PRESENT_SHARE, min_present, subtract_excess
 
 AXES: Final = 6
@@ -291,7 +291,7 @@ def ring_row(index: int, rows: int) -> int:
 def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> None:
     i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
     for i in range(np.uintp(n)):
-        d = float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
+        d = int_to_float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
         out[i] = d * d
 
 
@@ -324,6 +324,11 @@ def _replace_incomplete(
     """
     most, lanes, together, begin = m - min_present(m), np.uintp(LANES), np.uintp(AXES if shared else 1), np.uintp(own)
     for first in range(np.uintp(0), np.uintp(AXES), together):
+        newest, oldest = np.uintp(at0 + rows - 1) * lanes + first, np.uintp(at2) * lanes + first
+        if missing[newest] == missing[oldest]:  # all differences are complete
+            for lane in range(begin + first, begin + first + together):
+                terms[lane] += step * rows
+            continue
         older, newer, extra, counted, added = 0, 0, 0, 0, 0
         share_a = share_b = 1.0 / m
         for row in range(rows):

@@ -28,7 +28,7 @@ therefore does not depend on how the samples are distributed over calls.
   Gaussian noise. Heavy tails, spectral lines and coarse resolution increase F. The value of F at the time of the
   suspected change is used, because the change itself increases F.
 - **Bias steps** are detected by comparing the mean of a pair of blocks with the mean of the second pair before it. The
-  pair in between may contain the step.
+  pair in between may contain the step. Pairs with too many missing samples are skipped.
 """
 
 from typing import Final, NamedTuple
@@ -83,10 +83,12 @@ MIN_INFORMATION: Final = 0.5
 """Minimum share of the expectation of z² that is not caused by missing samples. For white noise, the share is ≥ 0.6."""
 MAX_GAP_RATIO: Final = 1.5
 """Maximum ratio of the mean squares of differences between successive samples and across one missing sample."""
+MIN_STEP_BLOCKS: Final = 4.0
+"""Distance of the block pairs before and after a step if no pair in between is missing, in blocks."""
+MAX_STEP_BLOCKS: Final = 16.0
+"""Maximum distance of the block pairs before and after a step, in blocks."""
 MAX_FLANK: Final = 12.0
 """Maximum ratio of the squared Haar differences before and after a step to the reference variance."""
-CONFIRM_PAIRS: Final = 2
-"""Number of block pairs after a step that must confirm the new mean."""
 SLOTS: Final = 4
 """Number of copies that each level of ``ChangeState.snap`` stores."""
 NEVER: Final = 1 << 62
@@ -125,7 +127,7 @@ class ChangeState(NamedTuple):
     stage: Floats  # [A, 32] samples of the current tick
     half: Floats  # [A, J, 2] sum and number of samples of the first block of a pair
     fill: Ints  # [A, J] number of complete block pairs for step detection; −1 excludes the current pair
-    ring: Floats  # [A, J, 2, 3] mean, difference and information of the last two block pairs
+    ring: Floats  # [A, J, 2, 4] mean, difference, information and end of the last two block pairs
     seeds: Floats  # [A, J, SEED] first squared Haar differences z²
     band: Floats  # [A, J, 7] reference; columns from N to GAP_S
     unit: (
@@ -146,7 +148,7 @@ def make_change_state(octaves: int) -> ChangeState:
     a, j = AXES, octaves
     state = ChangeState(
         np.zeros(7), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
-        np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 3)),
+        np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 4)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 7)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 5)),
         np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 5)), np.zeros((a, 6)),
@@ -350,7 +352,6 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
     if count1 + count2 < 2.0 * m:
         information = _information(count1, count2, m, _variance_ratio_within(s.band, axis, j))
     if information < MIN_INFORMATION:
-        s.fill[axis, j] = 0
         return
     d = sum2 / count2 - sum1 / count1
     mean = (sum1 + sum2) / (count1 + count2)
@@ -361,7 +362,8 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
         _seek_step(s, axis, j, mean, d, information, now)
     for i in range(s.ring.shape[3]):
         s.ring[axis, j, 0, i] = s.ring[axis, j, 1, i]
-    s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1], s.ring[axis, j, 1, 2] = mean, d, information
+    s.ring[axis, j, 1, 0], s.ring[axis, j, 1, 1] = mean, d
+    s.ring[axis, j, 1, 2], s.ring[axis, j, 1, 3] = information, now
     s.fill[axis, j] = min(fill + 1, 2)
 
 
@@ -585,14 +587,18 @@ def set_next_decision_sample(s: ChangeState) -> None:
 def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, information: float, now: int) -> None:
     """Search for a bias step between the newest pair of blocks and the second pair before it.
 
-    A step is rejected if the sensor moves, or if a linear drift explains the difference of the means.
+    Pairs with too many missing samples may lie in between. A step is rejected if the sensor moves, or if a linear drift
+    explains the difference of the means. Without missing pairs, the drift within the pairs shows it. Otherwise, the
+    pairs that confirm the step are at least as long as the distance, so that a drift would double the difference.
     """
-    ring = s.ring[axis, j]
+    ring, m = s.ring[axis, j], 1 << j
+    distance = (now - ring[0, 3]) / m
+    longest = j + int(np.ceil(np.log2(1.5 * distance - 1.0)))
     height = mean - ring[0, 0]
     # The variance of each mean is inversely proportional to its information.
     both = 2.0 * information * ring[0, 2] / (information + ring[0, 2])
     band = s.band[axis, j]
-    if band[N] == 0.0 or j + 3 >= s.band.shape[1]:
+    if band[N] == 0.0 or distance > MAX_STEP_BLOCKS or longest >= s.band.shape[1]:
         return
     v = band[S] / band[N]
     square = height * height
@@ -603,25 +609,33 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, informa
         return
     if now - s.born[axis] < s.levels[LEARN_TIME]:
         return
-    for above in range(j + 1, j + 4):
-        if s.band[axis, above, N] < MIN_BAND_TERMS:
+    slow = 0.0
+    for above in range(j + 1, longest + 1):
+        if s.band[axis, above, N] >= MIN_BAND_TERMS:
+            slow = 2.0 * s.band[axis, above, S] / s.band[axis, above, N]
+        elif above <= j + 3:
             return
-        # Random walk and flicker noise also change the mean over four blocks.
-        v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
+        else:
+            slow *= 2.0  # the variance of a random walk
+        # Random walk and flicker noise also change the mean over this distance.
+        v = max(v, slow)
     sigma = np.abs(height) * np.sqrt(both / (v * band[F]))
-    straight = height - 2.0 * (d + ring[0, 1])  # height without the linear drift on both sides
+    # height without the linear drift on both sides, which is too inaccurate for larger distances
+    straight = height - 2.0 * (d + ring[0, 1]) if distance == MIN_STEP_BLOCKS else height
     share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle block pair that follows the step
     if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:
         return
-    step, m = s.step[axis], 1 << j
+    step = s.step[axis]
     step[0], step[BEFORE], step[AFTER] = j, ring[0, 0], mean
-    step[PLACE] = now - 2.0 * m * (1.0 + min(max(share, 0.0), 1.0))
-    step[SIGMA], step[LEFT] = sigma, CONFIRM_PAIRS
+    # The step may lie between the pairs, or in the pair in the middle.
+    share, end = min(max(share, 0.0), 1.0), ring[1, 3]
+    step[PLACE] = 0.5 * (1.0 - share) * (end + now - 2.0 * m) + 0.5 * share * (end - 2.0 * m + ring[0, 3])
+    step[SIGMA], step[LEFT] = sigma, np.ceil(0.5 * distance)
 
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step after ``CONFIRM_PAIRS`` block pairs at the new mean, or discard it if the mean changes again."""
+    """Confirm a step after enough block pairs at the new mean, or discard it if the mean changes again."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0

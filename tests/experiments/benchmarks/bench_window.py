@@ -1,6 +1,7 @@
 """Cost of the sliding window (compared with allantools and a NumPy loop), of a fit and of the first use.
 
     python -m tests.experiments.benchmarks.bench_window [--rounds 15]
+    python -m tests.experiments.benchmarks.bench_window --loss 0.001 0.01 0.05 0.2   # only the cost of missing samples
 
 The window has six axes. ``allantools.realtime.oadev_realtime`` has one axis and removes no samples. Both get the same
 20 cluster sizes, in logarithmic steps up to a quarter of the window. They are measured when each sample adds a term to
@@ -64,12 +65,17 @@ def simulate_noise(n: int, seed: int = 1) -> Floats:
     return NOISE * np.random.default_rng(seed).standard_normal((n, AXES)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
 
 
-def fill_window(length: int) -> AllanWindow:
+def fill_window(length: int, loss: float = 0.0) -> AllanWindow:
     """Return a full window, which removes a sample for each new sample."""
     window = AllanWindow(length, cluster_sizes(length))
     for _ in range(-(-(length + BLOCK) // 100_000)):
-        window.append_samples(simulate_noise(min(100_000, length + BLOCK)))
+        window.append_samples(remove_at_random(simulate_noise(min(100_000, length + BLOCK)), loss))
     return window
+
+
+def remove_at_random(values: Floats, share: float) -> Floats:
+    """Return samples of which a share is missing on all axes."""
+    return np.where(np.random.default_rng(5).random((len(values), 1)) < share, np.nan, values)
 
 
 def make_append_loop(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
@@ -158,6 +164,26 @@ def print_window_costs(rounds: int) -> None:
     console.print(load.describe() + "\n")
 
 
+def print_loss_costs(losses: list[float], rounds: int) -> None:
+    """Print the cost per sample with random loss relative to the cost without loss."""
+    load, shares = Load(), [0.0, *losses]
+    table = create_table("cost with random loss over the cost without loss", "samples a call", "L", *map(str, shares))
+    works = {}
+    for length, loss in product(LENGTHS, shares):
+        window = fill_window(length, loss)
+        for how, n in (("blocks", 20_000), ("chunks", 20_000), ("singles", 2_000)):
+            values = remove_at_random(simulate_noise(n, 2), loss)
+            works[f"{how} {length} {loss}"] = make_append_loop(window, values, SAMPLES_PER_CALL[how])
+    took = time_alternately(works, rounds)
+    for how, length in product(SAMPLES_PER_CALL, LENGTHS):
+        medians = [took[f"{how} {length} {loss}"][0] for loss in shares]
+        without = f"{medians[0] / (2_000 if how == 'singles' else 20_000) * 1e6:.3f} µs"
+        ratios = [f"{median / medians[0]:.2f}" for median in medians[1:]]
+        table.add_row(f"{SAMPLES_PER_CALL[how]}", f"{length:,}", without, *ratios)
+    console.print(table)
+    console.print(load.describe() + "\n")
+
+
 def print_fit_cost(rounds: int) -> None:
     """Print the cost of ``Estimator.get_estimate`` for full windows and a growing window."""
     load = Load()
@@ -221,8 +247,13 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--rounds", type=int, default=15)
-    rounds = parser.parse_args().rounds
+    parser.add_argument("--loss", type=float, nargs="+", default=[], metavar="SHARE")
+    arguments = parser.parse_args()
+    rounds = arguments.rounds
     console.print(describe_machine())
+    if arguments.loss:
+        print_loss_costs(arguments.loss, rounds)
+        return
     print_window_costs(rounds)
     print_fit_cost(rounds)
     print_first_use()

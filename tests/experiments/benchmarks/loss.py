@@ -4,6 +4,7 @@
     python -m tests.experiments.benchmarks.loss --records 240 --generator simulator
     python -m tests.experiments.benchmarks.loss --recordings FOLDER
     python -m tests.experiments.benchmarks.loss --bias --records 1000
+    python -m tests.experiments.benchmarks.loss --reconcile --records 48
 
 Records of one hour at 100 Hz are simulated with N, B and K by the generator of ``records``, or by the simulator of the
 program. From each record, samples are removed in several ways. The table contains, for each way, the median width of
@@ -15,6 +16,11 @@ intervals and bounds, the largest ratio, and the share of the axes whose result 
 
 ``--bias`` compares the Allan deviations of records with 5 % random loss with those of the complete records, separately
 for white, flicker and random-walk noise.
+
+``--reconcile`` compares axes of ten minutes with their true models, and with models that lack one effect each. NumPy
+and SciPy simulate the axes. The table contains the number of axes that agree with the true model. For each lacking
+effect, it contains the number of axes on which the extended model explains the differences, and by how many percent the
+size of the effect differs from the size without loss: mean (smallest … largest).
 """
 
 import argparse
@@ -24,6 +30,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import butter, lfilter, sosfilt
 
 from drivers.data_types import AXES as AXIS_NAMES
 from drivers.data_types import Floats
@@ -36,8 +43,20 @@ from monitor.estimation.allan.batch import (
 from monitor.estimation.allan.uncertainty import covariance_table
 from monitor.estimation.fit.coefficient_fit import MeasuredVariancesAndSlopes, fit_coefficients, make_design_matrix
 from monitor.estimation.fit.coefficients_with_intervals import SYMBOLS, Status
-from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
+from monitor.noise.effect import Effect
+from monitor.noise.effects import (
+    AngleRandomWalk,
+    BandwidthLimit,
+    BiasInstability,
+    ExponentiallyCorrelated,
+    Narrowband,
+    QuantizationNoise,
+    RateRandomWalk,
+    Sinusoidal,
+)
 from monitor.noise.model import NoiseModel
+from monitor.reconcile.preparation.reconcile_input import RecordedAxes
+from monitor.reconcile.reconcile import reconcile
 from tests.experiments.benchmarks.records import AXES, MIX, RATE_HZ, Noise, Records, true_avar
 from tests.experiments.real_recordings.__main__ import CASES
 
@@ -55,10 +74,10 @@ def remove_at_random(share: float) -> Loss:
     return lambda values, rng: np.broadcast_to(rng.random((len(values), 1)) >= share, values.shape)
 
 
-def remove_bursts(values: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Remove 360 bursts of 10 samples."""
+def remove_bursts(values: Floats, rng: np.random.Generator, bursts: int = 360) -> NDArray[np.bool_]:
+    """Remove bursts of 10 samples."""
     present = np.ones(values.shape, np.bool_)
-    for begin in rng.integers(0, len(values) - 10, 360):
+    for begin in rng.integers(0, len(values) - 10, bursts):
         present[begin : begin + 10] = False
     return present
 
@@ -200,6 +219,87 @@ def measure_bias(records: int, seed: int) -> list[tuple[str, Floats, Floats]]:
     return rows
 
 
+RECONCILED_S: Final = 600
+SIZES: Final = {"gx": "N", "gy": "cutoff", "gz": "Q", "ax": "amplitude", "ay": "sigma", "az": "sigma"}
+"""Size of the effect that the incomplete model lacks or contains with a wrong size."""
+RECONCILED_LOSSES: Final[dict[str, Loss]] = {
+    "none": remove_at_random(0.0),
+    "1 % at random": remove_at_random(0.01),
+    "5 % at random": remove_at_random(0.05),
+    "10 % at random": remove_at_random(0.1),
+    "90 bursts of 10": lambda values, rng: remove_bursts(values, rng, 90),
+}
+
+
+def simulate_for_reconcile(rng: np.random.Generator) -> tuple[Floats, NoiseModel, NoiseModel]:
+    """Return six axes [n, 6] with different noise, the true model, and a model that lacks an effect on each axis."""
+    n, start = round(RECONCILED_S * RATE_HZ), 4000
+    noise, q = 1e-4, 1e-5 * rng.uniform(0.5, 2.0)
+    flicker, floor = noise * rng.uniform(0.2, 0.5), noise * 10.0 ** rng.uniform(-2.0, -1.0)
+    order, cutoff = int(rng.integers(1, 3)), rng.uniform(5.0, 30.0)
+    amplitude, line_hz = 1e-3 * rng.uniform(0.1, 0.5), rng.uniform(2.0, 45.0)
+    resonance, peak_hz, width_hz = 1e-3 * rng.uniform(0.3, 0.6), rng.uniform(5.0, 45.0), rng.uniform(0.5, 2.0)
+    correlated, time_s = 1e-3 * rng.uniform(0.3, 0.6), rng.uniform(0.5, 4.0)
+
+    white = noise * RATE_HZ**0.5 * rng.standard_normal((n + start, AXES))
+    values = white[start:].copy()
+    values[:, 0] = Records(Noise(N=noise, B=flicker), n).simulate_six(rng)[:, 0]
+    filtered = sosfilt(butter(order, cutoff, fs=RATE_HZ, output="sos"), white[:, 1])[start:]
+    values[:, 1] = filtered + floor * RATE_HZ**0.5 * rng.standard_normal(n)
+    values[:, 2] = Records(Noise(N=0.3 * noise, Q=q), n).simulate_six(rng)[:, 0]
+    values[:, 3] += amplitude * np.sin(2.0 * np.pi * (line_hz / RATE_HZ * np.arange(n) + rng.random()))
+    decay = np.exp((-np.pi * width_hz + 2j * np.pi * peak_hz) / RATE_HZ)
+    turning = (rng.standard_normal((n + start, 2)) * (1.0 - abs(decay) ** 2) ** 0.5) @ [1.0, 1j]
+    values[:, 4] += resonance * lfilter([1.0], [1.0, -decay], turning)[start:].real
+    phi = np.exp(-1.0 / (time_s * RATE_HZ))
+    drive = correlated * (1.0 - phi**2) ** 0.5 * rng.standard_normal(n + start)
+    values[:, 5] += lfilter([1.0], [1.0, -phi], drive)[start:]
+
+    term, bias = AngleRandomWalk(N=noise), BiasInstability(B=flicker)
+    true: dict[str, tuple[Effect, Effect]] = {
+        "gx": (term, bias),
+        "gy": (term, BandwidthLimit(cutoff=cutoff, order=order, floor=floor)),
+        "gz": (AngleRandomWalk(N=0.3 * noise), QuantizationNoise(Q=q)),
+        "ax": (term, Sinusoidal(amplitude=amplitude, frequency=line_hz)),
+        "ay": (term, Narrowband(sigma=resonance, frequency=peak_hz, bandwidth=width_hz)),
+        "az": (term, ExponentiallyCorrelated(sigma=correlated, correlation_time=time_s)),
+    }
+    lacking = {axis: effects[:1] for axis, effects in true.items()} | {"gx": (AngleRandomWalk(N=0.8 * noise), bias)}
+    return values, NoiseModel(true), NoiseModel(lacking)
+
+
+def print_reconcile(records: int, seed: int) -> None:
+    """Print the axes that agree with their true model, and the sizes of the effects that an incomplete model lacks."""
+    rng = np.random.default_rng(seed)
+    agree = dict.fromkeys(RECONCILED_LOSSES, 0)
+    sizes = {name: np.full((AXES, -(-records // AXES)), np.nan) for name in RECONCILED_LOSSES}
+    explained = {name: [0] * AXES for name in RECONCILED_LOSSES}
+    for record in range(-(-records // AXES)):
+        values, true, lacking = simulate_for_reconcile(rng)
+        for name, loss in RECONCILED_LOSSES.items():
+            kept = np.where(loss(values, rng), values, np.nan)
+            recording = RecordedAxes({axis: kept[:, k].copy() for k, axis in enumerate(AXIS_NAMES)}, RATE_HZ)
+            for axis, one in reconcile(recording, true, seed + record).axes.items():
+                agree[name] += one.verdict == "agrees"
+                if one.verdict != "agrees":
+                    print(f"record {record}, {name}: {axis} {one.verdict}, {[step.effect for step in one.steps]}")
+            for k, (axis, one) in enumerate(reconcile(recording, lacking, seed + record).axes.items()):
+                explained[name][k] += one.verdict == "explained"
+                if one.verdict != "explained":
+                    print(f"record {record}, {name}: {axis} {one.verdict}, {[step.effect for step in one.steps]}")
+                found = [step.parameters[SIZES[axis]].value for step in one.steps if SIZES[axis] in step.parameters]
+                sizes[name][k, record] = found[0] if len(found) == 1 else np.nan
+    names = ("N", "cutoff", "Q", "line", "resonance", "correlated noise")
+    print(f"| loss | true model agrees, of {AXES * -(-records // AXES)} | {' | '.join(names)} |\n| {'--- | ' * 8}")
+    for name, fitted in sizes.items():
+        ratio = fitted / sizes["none"] - 1.0
+        cells = [
+            f"{count}: {100.0 * np.nanmean(one):+.2f} ({100.0 * np.nanmin(one):+.2f} … {100.0 * np.nanmax(one):+.2f})"
+            for count, one in zip(explained[name], ratio, strict=True)
+        ]
+        print(f"| {name} | {agree[name]} | {' | '.join(cells)} |")
+
+
 def main() -> None:
     """Run the experiment and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -208,8 +308,12 @@ def main() -> None:
     parser.add_argument("--generator", choices=["exact", "simulator"], default="exact")
     parser.add_argument("--recordings", type=Path, metavar="FOLDER", help="folder of real recordings")
     parser.add_argument("--bias", action="store_true")
+    parser.add_argument("--reconcile", action="store_true")
     arguments = parser.parse_args()
     names = " | ".join(COEFFICIENTS)
+    if arguments.reconcile:
+        print_reconcile(arguments.records, arguments.seed)
+        return
     if arguments.bias:
         for noise, paired, total in measure_bias(arguments.records, arguments.seed):
             print(f"{noise}: bias over standard deviation, from the complete records {np.round(paired, 3).tolist()}")

@@ -1,5 +1,6 @@
 """Tests of the worker of one device: publication, rate checks, thermal models, compensation and times."""
 
+import re
 import threading
 import time
 from dataclasses import replace
@@ -7,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.data_types import Event, concatenate_blocks, make_block
+from drivers.data_types import AXES, Event, concatenate_blocks, make_block
 from drivers.decoders import dbc
 from drivers.decoders.binary_frames import vectornav_binary
 from drivers.decoders.messages import samples
@@ -23,6 +24,8 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.comparison_with_noise_model import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients_with_intervals import Status
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
+from monitor.noise.model import NoiseModel
 from monitor.publishing import exporters
 from monitor.publishing.messages.results import CoefficientsMessage, TotalAndHadamardCurves
 from monitor.settings import loading as settings
@@ -318,6 +321,33 @@ def test_status_states_the_missing_samples_of_the_window():
     loss = harness.worker.status.build_health({}, 0).loss
     assert loss.share == 0.05
     assert loss.wider["N"] > 0.02
+
+
+def test_random_loss_hardly_widens_the_intervals_and_the_status_states_the_loss():
+    n, rng, rows = 30_000, np.random.default_rng(1), []
+    sources = (AngleRandomWalk(N=1e-4), BiasInstability(B=2e-4), RateRandomWalk(K=1.5e-4))
+    values = NoiseModel(dict.fromkeys(AXES, sources)).simulate(n, RATE, 1)
+    lost = rng.random(n) < 0.05
+    for present in (np.arange(n), np.flatnonzero(~lost)):
+        harness, before = WorkerHarness(window_s=n / RATE, refit_s=1e3, publish_s=1e3, compensate=False), -1
+        gaps = np.flatnonzero(np.diff(present) > 1) + 1
+        for k, index in enumerate(np.split(present, np.union1d(gaps, np.arange(0, present.size, 500)))[1:]):
+            samples = make_block(
+                index * 10_000_000, values[index], np.full(index.size, 25.0), index, int(index[0]) - before - 1
+            )
+            before = int(index[-1])
+            harness.worker.driver.counts.received += index.size
+            harness.worker._push(samples)
+            harness.process(1000.0 + k)
+        harness.process(9000.0, drain=True)
+        coefficients = harness.output.estimates[-1][1].coefficients
+        rows.append((coefficients.status[1:4], (coefficients.hi - coefficients.lo)[1:4]))
+    (status, width), (status_with_loss, width_with_loss) = rows
+    assert (status == Status.ESTIMATED).all()
+    assert (status_with_loss == Status.ESTIMATED).all()
+    assert (np.median(width_with_loss / width, axis=1) <= 1.25).all()
+    sentence = harness.worker.status.build_health({}, 0).loss.describe()
+    assert re.fullmatch(r"(4\.9|5|5\.1) % of the samples are missing: intervals of .*N \d %.* wider", sentence)
 
 
 def test_unusable_tau_is_reported_and_samples_are_still_published():

@@ -348,9 +348,26 @@ def test_step_at_a_common_block_boundary_is_found():
     assert abs(change.since - (1 << 16)) <= 40
 
 
-def test_learned_ramp_is_not_a_step():
+@pytest.mark.parametrize(("first", "last"), [(99_900, 100_200), (100_000, 101_000), (99_500, 100_100)])
+def test_step_during_missing_samples_is_found(first, last):
+    """The step is at the beginning, within or at the end of the missing samples."""
+    values = simulate_white_noise(110_000)
+    values[100_000:, GZ] += 3 * SIGMA
+    values[first:last] = np.nan
+    change = find_single_change(values)
+    assert change.kind == "bias_stepped"
+    before, after = change.what["bias"]
+    assert after - before == pytest.approx(3 * SIGMA, rel=0.25)
+    assert first - 100 <= change.since <= last + 100
+
+
+@pytest.mark.parametrize("burst", [0, 100, 1000])
+@pytest.mark.parametrize("slope", [50, 500])
+def test_learned_ramp_is_not_a_step(burst, slope):
     values = simulate_white_noise(200_000)
-    values[:, GZ] += np.linspace(0.0, 50 * SIGMA, 200_000)
+    values[:, GZ] += np.linspace(0.0, slope * SIGMA, 200_000)
+    for begin in np.random.default_rng(1).integers(0, 200_000, 20_000 // burst if burst else 0):
+        values[begin : begin + burst] = np.nan
     assert [change.kind for change in find_changes(values) if change.kind == "bias_stepped"] == []
 
 
