@@ -256,10 +256,10 @@ class TextDecoder(base.RejectingDecoder):
                 self._rejection.note_rejection(self._clock_problem)
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         self._check_units(t_ns[~bad], values[~bad])
-        if self._unit_problem:
-            bad[:] = True
-            self._rejection.note_rejection(self._unit_problem)
         values[bad] = np.inf
+        if self._unit_problem:
+            values[:] = np.inf
+            self._rejection.note_rejection(self._unit_problem)
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
 
     def _check_time_unit(self, counts: Floats, t_ns: Ints) -> None:

@@ -7,7 +7,15 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
+from drivers.data_types import (
+    AXES,
+    ArrivalTimedFormat,
+    Chunk,
+    CounterTimedFormat,
+    Floats,
+    SampleBlock,
+    concatenate_blocks,
+)
 from drivers.decoders.text_lines.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
 from monitor.settings import loading
@@ -396,15 +404,15 @@ def test_simulated_sensor_with_a_pattern_is_refused_by_check(tmp_path: Path) -> 
     assert line.endswith("a simulated sensor cannot write lines for a pattern; use columns instead")
 
 
-def decode_live(values: np.ndarray, rate_hz: float = 50.0, **settings: object) -> tuple[int, str]:
+def decode_live(values: Floats, rate_hz: float = 50.0, **settings: str) -> tuple[int, str]:
     """Return the number of samples of lines that arrive one by one, and the problem that the decoder reports."""
-    decoder = build(Settings(columns=AXES, first_line="keep", **settings))
+    decoder = build(Settings.model_validate({"columns": AXES, "first_line": "keep", **settings}))
     lines = [b",".join(b"%.6g" % x for x in row) + b"\n" for row in values]
     count = sum(len(b) for i, line in enumerate(lines) for b in decoder.feed([Chunk(line, int(i / rate_hz * 1e9))]))
     return count, decoder.recent_problem
 
 
-def live_values(motion: str, seconds: float = 25.0, rate_hz: float = 50.0) -> np.ndarray:
+def live_values(motion: str, seconds: float = 25.0, rate_hz: float = 50.0) -> Floats:
     """Return samples [n, 6] in rad/s and m/s² of a tilted sensor with noise and a bias of 1 °/s."""
     t = np.arange(int(seconds * rate_hz)) / rate_hz
     values = np.random.default_rng(7).normal(size=(len(t), 6)) * np.repeat([math.radians(0.3), 0.05], 3)
@@ -423,7 +431,7 @@ def live_values(motion: str, seconds: float = 25.0, rate_hz: float = 50.0) -> np
         values[:, 3:] = values[:, 3:] @ np.diag([1, 1, 0]) + [1000.0, 0.0, 9.81]
     if motion == "upside down":
         values[:, 3:] *= -1.0
-    return values
+    return np.asarray(values)
 
 
 @pytest.mark.parametrize(
@@ -453,8 +461,8 @@ def test_lines_are_rejected_if_a_default_unit_is_impossible(
     count, problem = decode_live(values)
     assert count < 1100
     assert key in problem
-    given = {"gyro_unit": "rad/s", "accel_unit": "m/s²"}
-    assert decode_live(values, **given) == (len(values), "")  # the user decides
+    # The user decides.
+    assert decode_live(values, gyro_unit="rad/s", accel_unit="m/s²") == (len(values), "")
 
 
 def test_aliased_rotation_causes_no_doubt() -> None:
