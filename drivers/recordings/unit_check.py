@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
+from drivers.recordings.unit_inference import measure_rotation
 from drivers.units import DEGREE, G0, acceleration_factor, angular_rate_factor
 
 ACCELERATION_UNITS: Final = ("m/s²", "g", "mg", "mm/s²")
@@ -36,6 +37,61 @@ MAX_RATE_RAD_S: Final = 4000.0 * DEGREE
 """Median angular rate beyond the full scale of MEMS gyroscopes, rad/s."""
 MAD_TO_SIGMA: Final = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
+
+MAX_BIAS_RAD_S: Final = 25.0 * DEGREE
+"""Bias that no MEMS gyroscope exceeds."""
+MAX_CENTRIFUGE_RATE: Final = 5.0
+"""Angular rate below which no centrifuge generates 100 g: its radius would be 40 m."""
+MAX_STEP_RAD: Final = 2.0
+"""Largest rotation between two samples. If the rotation is larger, aliasing may hide the turn of gravity."""
+ROTATION_STEPS: Final = 100
+
+
+def describe_impossible_default_units(values: Floats, rate_hz: float, gyro_given: bool, accel_given: bool) -> str:
+    """Return why numbers of a live sensor cannot be in rad/s or m/s², or an empty text.
+
+    Only motions that are impossible on Earth are described, so that vehicles, centrifuges and rate tables pass. A
+    constant angular rate and a constant specific force are possible together only about a vertical axis. The component
+    of the specific force along this axis is then gravity, also in a centrifuge.
+
+    Parameters
+    ----------
+    values
+        [n, 6] float64 in the order of AXES, in rad/s and m/s² if the default units are right.
+    rate_hz
+        Sample rate in Hz.
+    gyro_given, accel_given
+        True if the user states the unit of the triad, which is then not examined.
+    """
+    rates, forces = values[:, :3], values[:, 3:]
+    if not np.isfinite(forces).all() or not np.ptp(forces, axis=0).any():
+        return ""
+    mean = forces.mean(axis=0)
+    force = float(np.linalg.norm(mean))
+    at_rest = bool((forces.std(axis=0) <= MAX_SPREAD_AT_REST * force).all())
+    measures_rates = bool(np.isfinite(rates).all() and np.ptp(rates, axis=0).all())
+    if at_rest and not accel_given and (unit := _find_acceleration_unit(forces, force, "m/s²")):
+        counts = unit.startswith("g/") and _are_integers(rates) and bool(np.ptp(rates) >= 2.0)
+        slow = unit == "mg" and float(np.median(np.linalg.norm(rates, axis=1))) < MAX_CENTRIFUGE_RATE
+        if unit == "g" or (measures_rates and (counts or slow)):
+            return f'the accelerometer measures {force:.4g} at rest, expected 9.81 m/s²: set accel_unit = "{unit}"'
+    if gyro_given or not measures_rates:
+        return ""
+    turn = measure_rotation(rates[np.newaxis], forces[np.newaxis], max(len(values) // ROTATION_STEPS, 1))
+    if turn is not None and abs(log(turn * rate_hz / DEGREE)) < log(1.4):
+        return (
+            f"gravity turns {1.0 / (turn * rate_hz):.3g} times less than the gyroscope in rad/s: "
+            'set gyro_unit = "deg/s"'
+        )
+    rate = rates.mean(axis=0)
+    size = float(np.linalg.norm(rate))
+    parts = rates[: len(rates) // 10 * 10].reshape(10, -1, 3).mean(axis=1)
+    constant = at_rest and bool((parts.std(axis=0) < 0.2 * size).all()) and abs(log(force / G0)) < MAX_GRAVITY_DISTANCE
+    visible = MAX_BIAS_RAD_S < size < MAX_STEP_RAD * rate_hz
+    if constant and visible and abs(float(mean @ rate)) < 0.8 * G0 * size:
+        fits = '"deg/s/131" or another scale of counts' if _are_integers(rates) else f'"deg/s" (bias {size:.2g} °/s)'
+        return f"gravity does not turn, but the gyroscope measures {size:.3g} in rad/s: set gyro_unit = {fits}"
+    return ""
 
 
 def describe_likely_unit_errors(

@@ -172,7 +172,7 @@ def _collect_evidence(columns: Mapping[str, Times], blocks: Sequence[slice], rat
         _smallest_noise(gyro, quiet) if at_rest else None, bias,
         0.0 if gyro is None else float(np.nanmax(np.abs(gyro), initial=0.0)),
         gravity, gravity_sigma, _smallest_noise(accel, quiet) if at_rest else None,
-        _measure_warming(columns.get("temperature")), _measure_rotation(gyro, accel),
+        _measure_warming(columns.get("temperature")), measure_rotation(gyro, accel),
     )  # fmt: skip
 
 
@@ -227,7 +227,7 @@ def _measure_warming(temperature: Times | None, parts: int = 8) -> float:
     return float(np.nanmax(np.abs(np.diff(means)), initial=0.0)) / size
 
 
-def _measure_rotation(gyro: Floats | None, accel: Floats | None, rows: int = 32) -> float | None:
+def measure_rotation(gyro: Floats | None, accel: Floats | None, rows: int = 32) -> float | None:
     """Return the angle in rad per unit of angular rate and sample, or None if the sensor turns too little.
 
     Gravity is at rest, so its direction in the sensor changes by minus the cross product of angle and direction.

@@ -54,8 +54,8 @@ def identify_file(path: Path) -> IdentifiedSource:
         data = file.read(MAX_BYTES)
     found = identify_wire_format(data)
     if found is None:
-        text = _quote_text(decode_readable_lines(data))
-        raise NotReady(f"{path}: no decoder finds samples in the first {len(data)} bytes{text}")
+        text = _describe_text(decode_readable_lines(data))
+        raise NotReady(f"{path}: {text or f'no decoder finds samples in the first {len(data)} bytes'}")
     return IdentifiedSource(str(path), found)
 
 
@@ -94,21 +94,21 @@ def identify_port(port: str, listen_s: float, report: Callable[[str], None]) -> 
         if found is not None:
             rate_hz = found.rate_hz or (found.samples / seconds if seconds > 0.0 else None)
             return IdentifiedSource(port, replace(found, rate_hz=rate_hz), baudrate)
-        if text := _quote_text(decode_readable_lines(data)):
-            raise NotReady(f"{port}: {baudrate} baud: no decoder finds samples in {len(data)} bytes{text}")
+        if text := _describe_text(decode_readable_lines(data)):
+            raise NotReady(f"{port}: {baudrate} baud: {text}")
         report(f"{baudrate} baud: {len(data)} bytes, no known format")
     if not received:
         raise NotReady(f"{port}: no bytes at any baud rate; {NO_BYTES_ADVICE}")
     raise NotReady(f"{port}: no decoder finds samples at any baud rate; try a longer time with --seconds")
 
 
-def _quote_text(lines: Sequence[str]) -> str:
-    """Return the end of a message about readable text without a known layout; "" if there are no lines."""
+def _describe_text(lines: Sequence[str]) -> str:
+    """Return a message about readable text without a known layout; "" if there are no lines."""
     quoted = ", ".join(map(_to_toml, show_text(lines)))
     advice = "print all axes of a sample in one line, with the same text between the numbers"
     if len(lines) < MIN_LINES + 2:  # the first and the last line are not examined
         advice = f"at least {MIN_LINES + 2} lines are needed; try a longer time with --seconds"
-    return f", but the text is readable: {quoted}; {advice}" if lines else ""
+    return f"the text is readable, but its lines have no known layout: {quoted}; {advice}" if lines else ""
 
 
 def show_text(lines: Sequence[str]) -> list[str]:

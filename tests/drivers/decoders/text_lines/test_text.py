@@ -7,7 +7,15 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
+from drivers.data_types import (
+    AXES,
+    ArrivalTimedFormat,
+    Chunk,
+    CounterTimedFormat,
+    Floats,
+    SampleBlock,
+    concatenate_blocks,
+)
 from drivers.decoders.text_lines.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
 from monitor.settings import loading
@@ -394,3 +402,70 @@ def test_simulated_sensor_with_a_pattern_is_refused_by_check(tmp_path: Path) -> 
     path.write_text(f'[[device]]\nname = "a"\ndriver = {driver}\n')
     (line,) = loading.examine_config_file(path).wrong
     assert line.endswith("a simulated sensor cannot write lines for a pattern; use columns instead")
+
+
+def decode_live(values: Floats, rate_hz: float = 50.0, **settings: str) -> tuple[int, str]:
+    """Return the number of samples of lines that arrive one by one, and the problem that the decoder reports."""
+    decoder = build(Settings.model_validate({"columns": AXES, "first_line": "keep", **settings}))
+    lines = [b",".join(b"%.6g" % x for x in row) + b"\n" for row in values]
+    count = sum(len(b) for i, line in enumerate(lines) for b in decoder.feed([Chunk(line, int(i / rate_hz * 1e9))]))
+    return count, decoder.recent_problem
+
+
+def live_values(motion: str, seconds: float = 25.0, rate_hz: float = 50.0) -> Floats:
+    """Return samples [n, 6] in rad/s and m/s² of a tilted sensor with noise and a bias of 1 °/s."""
+    t = np.arange(int(seconds * rate_hz)) / rate_hz
+    values = np.random.default_rng(7).normal(size=(len(t), 6)) * np.repeat([math.radians(0.3), 0.05], 3)
+    angle = np.full(len(t), 0.6)
+    if motion == "tilting":
+        angle = 0.6 + 0.5 * np.sin(t)
+        values[:, 0] += 0.5 * np.cos(t)
+    if motion == "fast rotation about the vertical":
+        values[:, 1] += 30.0 * np.sin(angle)
+        values[:, 2] += 30.0 * np.cos(angle)
+    values[:, 0] += math.radians(1.0)
+    values[:, 4] += 9.81 * np.sin(angle)
+    values[:, 5] += 9.81 * np.cos(angle)
+    if motion == "centrifuge at 100 g":
+        values[:, 2] += 100.0
+        values[:, 3:] = values[:, 3:] @ np.diag([1, 1, 0]) + [1000.0, 0.0, 9.81]
+    if motion == "upside down":
+        values[:, 3:] *= -1.0
+    return np.asarray(values)
+
+
+@pytest.mark.parametrize(
+    "motion", ["rest", "tilting", "upside down", "fast rotation about the vertical", "centrifuge at 100 g"]
+)
+def test_possible_motions_never_cause_doubt_about_units(motion: str) -> None:
+    values = live_values(motion)
+    assert decode_live(values) == (len(values), "")
+
+
+@pytest.mark.parametrize(
+    ("factors", "motion", "key"),
+    [
+        ((math.degrees(1), 1.0), "rest", 'gyro_unit = "deg/s"'),
+        ((math.degrees(1), 1.0), "tilting", 'gyro_unit = "deg/s"'),
+        ((math.degrees(1), 1 / 9.80665), "rest", 'accel_unit = "g"'),
+        ((1.0, 1 / 9.80665), "upside down", 'accel_unit = "g"'),
+        ((1.0, 1000 / 9.80665), "rest", 'accel_unit = "mg"'),
+        ((16.4 * math.degrees(1), 2048 / 9.80665), "rest", 'accel_unit = "g/2048"'),
+    ],
+)
+def test_lines_are_rejected_if_a_default_unit_is_impossible(
+    factors: tuple[float, float], motion: str, key: str
+) -> None:
+    values = live_values(motion) * np.repeat(factors, 3)
+    values = np.rint(values) if max(factors) > 105.0 else values
+    count, problem = decode_live(values)
+    assert count < 1100
+    assert key in problem
+    # The user decides.
+    assert decode_live(values, gyro_unit="rad/s", accel_unit="m/s²") == (len(values), "")
+
+
+def test_aliased_rotation_causes_no_doubt() -> None:
+    values = live_values("rest", 600.0, rate_hz=1.0)
+    values[:, 0] += math.tau  # one turn per sample about a horizontal axis
+    assert decode_live(values, 1.0) == (len(values), "")
