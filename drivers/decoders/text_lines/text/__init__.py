@@ -41,7 +41,6 @@ from drivers.decoders.text_lines.text.settings import (
     compute_factors_and_offsets,
 )
 from drivers.errors import ConfigError
-from drivers.recordings.unit_check import describe_impossible_default_units
 
 LABEL: Final = re.compile(rb"([^:]*[A-Za-z][^:]*):(.*)", re.DOTALL)
 """Regular expression that matches the label and the number of a field."""
@@ -297,6 +296,9 @@ class TextDecoder(base.RejectingDecoder):
         self._unit_checks += 1
         problem = ""
         if duration_s >= MIN_UNIT_CHECK_S:  # a capture that is replayed at once has no usable arrival times
+            # Most configurations state their units and need none of these modules.
+            from drivers.recordings.unit_check import describe_impossible_default_units
+
             problem = describe_impossible_default_units(window, lines / duration_s, gyro_given, accel_given)
         self._unit_problem = problem if problem and self._suspected else ""
         self._suspected = problem
