@@ -46,7 +46,7 @@ mode = "none"
 """
 MANY_LINES = """
 import structlog
-from monitor.cli import main
+from imu_monitor import main
 from monitor.daemon.service import Service
 run = Service.run
 def run_after_many_lines(self, seconds=None):

@@ -1160,7 +1160,7 @@ def test_interrupted_analysis_ends_in_one_line(tmp_path: Path) -> None:
 import sys
 import threading
 import monitor.commands.analyze as offline
-from monitor.cli import main
+from imu_monitor import main
 def report_start(*values, **options):
     print("working", file=sys.stderr, flush=True)
     from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
@@ -1183,7 +1183,7 @@ def test_signal_ends_reconcile_without_traceback(tmp_path: Path) -> None:
 import sys
 import threading
 import monitor.commands.reconcile as reconciling
-from monitor.cli import main
+from imu_monitor import main
 original = reconciling.reconcile
 def report_start(recording, model, seed, each, tell):
     print("working", file=sys.stderr, flush=True)
@@ -1343,7 +1343,7 @@ RECORDING_DEMO = """
 import json, sys
 import monitor.daemon.service
 from drivers.data_types import concatenate_blocks
-from monitor.cli import main
+from imu_monitor import main  # ends the process although daemon threads are running
 from tests.system.rig import RecordingOutput
 run = monitor.daemon.service.Service.run
 def counted(self, *arguments):
