@@ -84,6 +84,10 @@ class TextDecoder(base.RejectingDecoder):
         self.timing: Timing = _timing(settings, self._names)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
+        scaled = {axis[0] for axis in settings.scale}
+        self._stated_units = [  # whether the unit of the gyroscopes and of the accelerometers is stated
+            f"{triad}_unit" in settings.model_fields_set or triad[0] in scaled for triad in ("gyro", "accel")
+        ]
         self.forget_stream_state()
 
     def forget_stream_state(self) -> None:
@@ -254,7 +258,9 @@ class TextDecoder(base.RejectingDecoder):
                 bad[:] = True
                 self._rejection.note_rejection(self._clock_problem)
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
-        self._check_units(t_ns[~bad], values[~bad])
+        judged = all(self._stated_units) or self._unit_checks >= MAX_UNIT_CHECKS or self._unit_problem
+        if not (judged or bad.all()):
+            self._check_units(t_ns[~bad], values[~bad])
         values[bad] = np.inf
         if self._unit_problem:
             values[:] = np.inf
@@ -282,10 +288,6 @@ class TextDecoder(base.RejectingDecoder):
 
     def _check_units(self, t_ns: Ints, values: Floats) -> None:
         """Set ``_unit_problem`` if two consecutive windows show that a unit that is not given is impossible."""
-        given, scaled = self._settings.model_fields_set, {axis[0] for axis in self._settings.scale}
-        gyro_given, accel_given = "gyro_unit" in given or "g" in scaled, "accel_unit" in given or "a" in scaled
-        if (gyro_given and accel_given) or self._unit_checks >= MAX_UNIT_CHECKS or self._unit_problem or not len(t_ns):
-            return
         self._unit_window.append((t_ns, values))
         self._unit_lines += len(t_ns)
         lines, duration_s = self._unit_lines, int(t_ns[-1] - self._unit_window[0][0][0]) * 1e-9
@@ -299,7 +301,7 @@ class TextDecoder(base.RejectingDecoder):
             # Most configurations state their units and need none of these modules.
             from drivers.recordings.unit_check import describe_impossible_default_units
 
-            problem = describe_impossible_default_units(window, lines / duration_s, gyro_given, accel_given)
+            problem = describe_impossible_default_units(window, lines / duration_s, *self._stated_units)
         self._unit_problem = problem if problem and self._suspected else ""
         self._suspected = problem
 
