@@ -6,7 +6,6 @@ release the global interpreter lock of Python.
 """
 
 import os
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.data_types import AXES, Ints, SampleBlock
+from drivers.data_types import AXES, Ints
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import Recording, iter_blocks
 from drivers.validation.number_ranges import AVERAGING_TIME_S
@@ -23,7 +22,6 @@ from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
 from monitor.drift.thermal.temperature_removal import (
     TemperatureRemovalComparison,
     remove_temperature_effect,
-    temperature_varied,
 )
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.curve import VarianceCurve
@@ -31,7 +29,6 @@ from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic
 from monitor.estimation.allan.hadamard import compute_hadamard_curve
 from monitor.estimation.allan.total import compute_total_curve
 from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_disturbances
-from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
 from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
@@ -130,19 +127,20 @@ def analyze_recording(
     TooFewSamples
         If the recording has too few samples for any result.
     """
-    blocks = list(iter_blocks(recording))
     pool = ThreadPoolExecutor(os.cpu_count())
     try:
         report_progress("curve and fit", None)
         try:
-            result = analyze(blocks, recording.rate_hz, tau, recording.notes, pool.map, exclude_motion)
+            result = analyze(
+                list(iter_blocks(recording)), recording.rate_hz, tau, recording.notes, pool.map, exclude_motion
+            )
         except NotReady as error:
             raise TooFewSamples(str(error), len(recording)) from error
         stage = "motion and changes" + (", total and Hadamard deviations" if total_and_hadamard else "")
         report_progress(stage, None)
         events = pool.submit(detect_disturbances, result)
         others = pool.submit(_total_and_hadamard, result, tau) if total_and_hadamard else None
-        warmth = pool.submit(_without_temperature, result, blocks, recording.rate_hz)
+        warmth = pool.submit(remove_temperature_effect, result)
         courses, lacking = _dynamic_curves(result, tau, window_s, report_progress)
         total, hadamard = others.result() if others else (None, None)
         found_all = events.result()
@@ -189,16 +187,6 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str, units:
         write_html_report(drawn, path, title)
     else:
         save_analysis_plot(drawn, path, title)
-
-
-def _without_temperature(
-    result: RecordingAnalysis, blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> TemperatureRemovalComparison | None:
-    """Return the coefficients without the effect of temperature, or None if the temperature is missing or constant."""
-    if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
-        return None
-    _, temperature_c, _, _ = place_samples_and_temperature_on_grid(blocks, rate_hz)
-    return remove_temperature_effect(result, temperature_c)
 
 
 def _dynamic_curves(

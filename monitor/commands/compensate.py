@@ -24,7 +24,7 @@ from monitor.drift.compensation.compensation_score import AxisCompensation, Drif
 from monitor.drift.compensation.gyro_drift_compensator import Compensator, MeasuredAndPredictedDrift
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECTED, STEPPED, USED
-from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
+from monitor.estimation.regular_grid import place_samples_on_grid
 
 METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
 GYROS: Final = AXES[:3]
@@ -73,9 +73,8 @@ def run_compensation(
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
         raise ConfigError(f"{recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
-    values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
-        list(iter_blocks(found)), found.rate_hz
-    )
+    grid = place_samples_on_grid(list(iter_blocks(found)), found.rate_hz)
+    values, temperature_c, rate_hz, notes = grid.values, grid.temperature_c, grid.rate_hz, grid.notes_with_missing()
     orders = ORDERS if order is None else (order,)
     live = Compensator(rate_hz, adapts=method != "fixed", orders=orders)
     compensated = _run(live, values, report_progress)

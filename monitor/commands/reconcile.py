@@ -25,7 +25,7 @@ from drivers.recordings.writing import atomic_write_path
 from monitor.commands.progress_callback import ProgressCallback, ignore_progress
 from monitor.commands.recording_loading import DEFAULT_LOADING, LoadingOptions, load_recording
 from monitor.common.unit_formatting import DEFAULT_UNITS, UnitSystem
-from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
+from monitor.estimation.regular_grid import place_samples_on_grid
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.json_report import COMPARISON_SCHEMA, SCHEMA, encode_comparison, encode_report
 from monitor.reconcile.preparation.reconcile_input import RecordedAxes
@@ -296,11 +296,9 @@ def create_report_folder(folder: Path) -> None:
 
 def _to_regular_grid(found: Samples) -> tuple[RecordedAxes, list[str]]:
     """Return the recording on a regular time grid, and notes about the resampling."""
-    values, temperature_c, rate_hz, notes = place_samples_and_temperature_on_grid(
-        list(iter_blocks(found)), found.rate_hz
-    )
-    columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
-    return RecordedAxes(columns, rate_hz, temperature_c), notes
+    grid = place_samples_on_grid(list(iter_blocks(found)), found.rate_hz)
+    columns = {axis: np.ascontiguousarray(grid.values[:, AXES.index(axis)], np.float64) for axis in found.axes}
+    return RecordedAxes(columns, grid.rate_hz, grid.temperature_c), grid.notes_with_missing()
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -28,7 +28,7 @@ from monitor.drift.thermal.thermal_results import (
     choose_interval_s,
     compare_model_with_means,
 )
-from monitor.estimation.regular_grid import place_samples_and_temperature_on_grid
+from monitor.estimation.regular_grid import place_samples_on_grid
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
 
@@ -223,13 +223,13 @@ def _read_interval_means(
 ) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
     """Return the interval means of each recorded axis, and notes about the recording."""
     found = load_recording(recording, loading, report_progress)
-    values, temperature_c, rate, notes = place_samples_and_temperature_on_grid(list(iter_blocks(found)), found.rate_hz)
-    if not np.isfinite(temperature_c).any():
+    grid = place_samples_on_grid(list(iter_blocks(found)), found.rate_hz)
+    if not np.isfinite(grid.temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
-    interval_s = interval_s or choose_interval_s(temperature_c.size / rate, rate)
+    interval_s = interval_s or choose_interval_s(len(grid.values) / grid.rate_hz, grid.rate_hz)
     means = {
-        axis: compute_interval_means(values[:, at], temperature_c, rate, interval_s)
+        axis: compute_interval_means(grid.values[:, at], grid.temperature_c, grid.rate_hz, interval_s)
         for at, axis in enumerate(AXES)
-        if np.isfinite(values[:, at]).any()
+        if np.isfinite(grid.values[:, at]).any()
     }
-    return means, (*found.notes, *notes)
+    return means, (*found.notes, *grid.notes_with_missing())

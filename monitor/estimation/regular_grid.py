@@ -9,6 +9,7 @@ values at a later time are kept. A sample rate that the user states takes preced
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -39,8 +40,8 @@ MIN_REPEATED_SHARE: Final = 0.01
 MAX_GAP_SAMPLES: Final = 1_000_000
 """Maximum number of missing samples that are stored for one gap, at 48 bytes per sample.
 
-A longer gap is replaced by one missing sample. ``place_samples_and_pauses_on_grid`` returns its row, because no cluster
-may contain samples from both sides of the gap.
+A longer gap is replaced by one missing sample, a row of ``RegularGrid.pauses``, because no cluster may contain samples
+from both sides of the gap.
 """
 SEGMENTS: Final = 8
 """Number of segments into which a recording is divided to compute the standard error of the mean rate."""
@@ -50,9 +51,24 @@ UNEVEN_STEP_SHARE: Final = 0.5
 """Minimum reported deviation of the 10 % and 90 % quantiles of the time steps, as a fraction of the sample period."""
 
 
-def place_samples_and_pauses_on_grid(
-    blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> tuple[Floats, Ints, float, list[str]]:
+@dataclass(frozen=True, slots=True)
+class RegularGrid:
+    """Samples on a regular time grid. The arrays may share memory with the recording and must not be modified."""
+
+    values: Floats  # [n, 6], rad/s and m/s²; NaN = missing
+    temperature_c: Floats  # [n] °C; NaN = missing or not measured
+    pauses: Ints  # rows that replace a gap of more than MAX_GAP_SAMPLES samples
+    rate_hz: float
+    notes: list[str]  # irregularities of the time stamps and the values, other than the missing samples
+    missing: int  # rows without a sample
+
+    def notes_with_missing(self) -> list[str]:
+        """Return the notes, and a note on the share of missing samples if there are any."""
+        share = format_two_significant_digits(100.0 * self.missing / len(self.values))
+        return [*self.notes, *([f"{share} % of the samples are missing"] if self.missing else [])]
+
+
+def place_samples_on_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> RegularGrid:
     """Place the samples of a recording on a regular time grid, with NaN for missing samples.
 
     Parameters
@@ -61,67 +77,20 @@ def place_samples_and_pauses_on_grid(
         Recording with time stamps.
     rate_hz : float or None
         Sample rate in Hz that the user has stated. If None, the rate is estimated from the time stamps.
-
-    Returns
-    -------
-    values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
-    pauses : ndarray of int64
-        Rows that replace a gap of more than ``MAX_GAP_SAMPLES`` samples.
-    rate_hz : float
-        Sample rate in Hz.
-    notes : list of str
-        Notes for the user on irregularities of the time stamps and the values, other than the missing samples.
     """
-    stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
-    begins = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
-    stored = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
-    return values, (begins + np.cumsum(stored) - stored)[lost > MAX_GAP_SAMPLES], rate, notes
-
-
-def place_samples_and_temperature_on_grid(
-    blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> tuple[Floats, Floats, float, list[str]]:
-    """Place the samples and temperatures of a recording on a regular time grid.
-
-    Parameters
-    ----------
-    blocks, rate_hz
-        See ``place_samples_and_pauses_on_grid``.
-
-    Returns
-    -------
-    values, rate_hz
-        See ``place_samples_and_pauses_on_grid``.
-    temperature_c : ndarray of float64, shape (n,)
-        Temperature in °C, returned after ``values``; NaN means not measured.
-    notes : list of str
-        See ``place_samples_and_pauses_on_grid``. The last note states the share of the missing samples.
-    """
-    stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
-    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
-    parts = [
-        part
-        for samples, hole in zip(stamped, missing.tolist(), strict=True)
-        for part in (np.full(hole, np.nan), samples.temperature_c)
-    ]
-    if missing.any():
-        share = format_two_significant_digits(100.0 * float(missing.sum()) / len(values))
-        notes.append(f"{share} % of the samples are missing")
-    return values, np.concatenate(parts), rate, notes
-
-
-def _resample(
-    blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> tuple[list[SampleBlock], Ints, Floats, float, list[str]]:
     stamped, lost, rate, notes = _stamp(blocks, rate_hz)
-    values = _place_on_grid(stamped, lost)
+    paused = lost > MAX_GAP_SAMPLES
+    missing = np.where(paused, 1, lost)
+    values = _insert_missing([samples.values for samples in stamped], missing)
+    temperature_c = _insert_missing([samples.temperature_c for samples in stamped], missing)
     notes += _repeated_notes(values) + _resolution_notes(find_coarsely_quantized_axes(values))
     notes += [
         f"a pause of {n / rate:.6g} s is too long to be kept and is replaced by one missing sample"
-        for n in lost[lost > MAX_GAP_SAMPLES]
+        for n in lost[paused]
     ]
-    return stamped, lost, values, rate, notes
+    begins = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
+    pauses = (begins + np.cumsum(missing) - missing)[paused]
+    return RegularGrid(values, temperature_c, pauses, rate, notes, int(missing.sum()))
 
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
@@ -160,19 +129,17 @@ def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, in
     return missing, int((short & (missing == 0)).sum())
 
 
-def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
-    """Return all samples in one array [n, 6], which is not a copy if the blocks are contiguous."""
-    missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
-    if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
+def _insert_missing(parts: Sequence[Floats], missing: Ints) -> Floats:
+    """Join parts, with the given number of NaN rows before each. The result is no copy if the parts are contiguous."""
+    if not missing.any() and (whole := _contiguous(parts)) is not None:
         return whole
-    values = np.empty((int(missing.sum()) + sum(len(samples) for samples in stamped), 6))
+    joined = np.full((int(missing.sum()) + sum(map(len, parts)), *parts[0].shape[1:]), np.nan)
     row = 0
-    for samples, hole in zip(stamped, missing.tolist(), strict=True):
-        values[row : row + hole] = np.nan
+    for part, hole in zip(parts, missing.tolist(), strict=True):
         row += hole
-        values[row : row + len(samples)] = samples.values
-        row += len(samples)
-    return values
+        joined[row : row + len(part)] = part
+        row += len(part)
+    return joined
 
 
 def _contiguous(parts: Sequence[Floats]) -> Floats | None:

@@ -12,6 +12,8 @@ PARTS_PER_INTERVAL: Final = 8
 MIN_KNOWN_SHARE: Final = 0.5
 MAX_MEANS: Final = 150
 """Maximum number of interval means in a regression. Longer recordings are averaged in groups of intervals."""
+BLOCK_SAMPLES: Final = 1 << 18
+"""Number of samples that are processed at once."""
 BUFFER_ROWS: Final = 1024
 TEMPERATURE_COLUMN: Final = len(AXES)
 
@@ -98,10 +100,23 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
     ([24.5, 74.5], [25.0, 25.0])
     """
     length = max(round(interval_s * rate_hz), 1)
-    n = values.size // length
-    bias, error = _row_means(values[: n * length].reshape(n, length))
-    mean_temperature_c, _ = _row_means(temperature_c[: n * length].reshape(n, length))
+    (bias, error), (mean_temperature_c, _) = (
+        _means_of_intervals(values, length),
+        _means_of_intervals(temperature_c, length),
+    )
     return IntervalMeans(length / rate_hz, bias, error, mean_temperature_c)
+
+
+def _means_of_intervals(samples: Floats, length: int) -> tuple[Floats, Floats]:
+    """Return the mean and the standard error of each complete interval of ``length`` samples."""
+    n = samples.size // length
+    rows = max(BLOCK_SAMPLES // length, 1)  # intermediate results of all samples would need much memory
+    parts = [
+        _row_means(samples[row * length : min(row + rows, n) * length].reshape(-1, length))
+        for row in range(0, max(n, 1), rows)
+    ]
+    mean, error = map(np.concatenate, zip(*parts, strict=True))
+    return mean, error
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:

@@ -6,14 +6,15 @@ part of a random walk by chance. A change of K or R by a few percent is therefor
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, fields
 from typing import Final
 
 import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
-from monitor.drift.thermal.interval_means import compute_interval_means
+from monitor.drift.thermal.interval_means import BLOCK_SAMPLES, compute_interval_means
 from monitor.drift.thermal.thermal_fit import MIN_SWING_C, ThermalFit, fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict_interval_means
 from monitor.drift.thermal.thermal_results import choose_interval_s
@@ -106,28 +107,20 @@ def temperature_varied(temperatures_c: Floats) -> bool:
     )
 
 
-def remove_temperature_effect(
-    analysis: RecordingAnalysis, temperature_c: Floats
-) -> TemperatureRemovalComparison | None:
+def remove_temperature_effect(analysis: RecordingAnalysis) -> TemperatureRemovalComparison | None:
     """Compute the noise coefficients of a recording after removal of the temperature dependence of the bias.
 
-    Parameters
-    ----------
-    analysis : RecordingAnalysis
-        Analysis of a recording.
-    temperature_c : ndarray, shape (n,)
-        Temperature of each sample, °C.
-
-    Returns
-    -------
-    TemperatureRemovalComparison or None
-        Noise coefficients before and after the removal, or None if no axis depends on temperature.
+    The result is None if the temperature is missing or constant, or if no axis depends on it.
     """
-    rate_hz = analysis.estimate.rate_hz
+    temperature_c, rate_hz = analysis.temperature_c, analysis.estimate.rate_hz
+    if not temperature_varied(temperature_c):
+        return None
     interval_s = choose_interval_s(len(analysis.values) / rate_hz, rate_hz)
-    values, models, dependences = analysis.values, dict[str, str](), dict[str, TemperatureDependence]()
+    models, dependences = dict[str, str](), dict[str, TemperatureDependence]()
+    after, k_or_r = deepcopy(analysis.estimate.coefficients), list(map(bool, analysis.estimate.k_or_r))
     for at, axis in enumerate(AXES):
-        means = compute_interval_means(analysis.values[:, at], temperature_c, rate_hz, interval_s)
+        samples = analysis.values[:, at]
+        means = compute_interval_means(samples, temperature_c, rate_hz, interval_s)
         try:
             found = fit_thermal_model(means)
         except NotReady:
@@ -137,18 +130,16 @@ def remove_temperature_effect(
             continue
         dependences[axis], model = dependence, found.model
         if not model.shape.is_constant:
-            values = values.copy() if values is analysis.values else values
-            course = predict_interval_means(model, means.temperature_c, starts_with_fit=True).bias
-            values[:, at] -= interpolate_with_zero_mean(course, round(means.interval_s * rate_hz), len(values))
             models[axis] = model.shape.name
+            course = predict_interval_means(model, means.temperature_c, starts_with_fit=True).bias
+            effect = interpolate_with_zero_mean(course, round(means.interval_s * rate_hz), len(samples))
+            fit = fit_other_samples(analysis, (samples - effect)[:, None])
+            k_or_r[at] = bool(fit.k_or_r[0])
+            for one in fields(after):
+                getattr(after, one.name)[:, at] = getattr(fit.coefficients, one.name)[:, 0]
     if not dependences:
         return None
-    before, k_or_r = analysis.estimate.coefficients, analysis.estimate.k_or_r
-    after = before
-    if models:
-        fit = fit_other_samples(analysis, values)
-        after, k_or_r = fit.coefficients, fit.k_or_r
-    return TemperatureRemovalComparison(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+    return TemperatureRemovalComparison(models, analysis.estimate.coefficients, after, tuple(k_or_r), dependences)
 
 
 def find_temperature_dependence(found: ThermalFit) -> TemperatureDependence | None:
@@ -191,16 +182,20 @@ def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
     bend = _natural_spline(interval_values)
-    at = (np.arange(n_samples) + 0.5) / interval_samples - 0.5  # in intervals from the centre of the first one
-    left = np.clip(at.astype(np.int64), 0, interval_values.size - 2)
-    right = left + 1
-    t = np.clip(at, 0.0, interval_values.size - 1.0) - left
-    made = (1.0 - t) * interval_values[left] + t * interval_values[right]
-    made += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
     first = interval_values[1] - interval_values[0] - bend[1] / 6.0
     last = interval_values[-1] - interval_values[-2] + bend[-2] / 6.0
-    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (interval_values.size - 1.0), 0.0)
-    return np.asarray(made - made.mean())
+    made = np.empty(n_samples)
+    for begin in range(0, n_samples, BLOCK_SAMPLES):  # intermediate results of all samples would need much memory
+        block = made[begin : begin + BLOCK_SAMPLES]
+        at = (np.arange(begin, begin + block.size) + 0.5) / interval_samples - 0.5  # intervals from the first centre
+        left = np.clip(at.astype(np.int64), 0, interval_values.size - 2)
+        right = left + 1
+        t = np.clip(at, 0.0, interval_values.size - 1.0) - left
+        block[:] = (1.0 - t) * interval_values[left] + t * interval_values[right]
+        block += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
+        block += first * np.minimum(at, 0.0) + last * np.maximum(at - (interval_values.size - 1.0), 0.0)
+    made -= made.mean()
+    return made
 
 
 def _natural_spline(y: Floats) -> Floats:

@@ -12,7 +12,7 @@ from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import MIN_SAMPLES, analyze, detect_disturbances
 from monitor.estimation.detection.motion_detection import detect_motion
 from monitor.estimation.fit.coefficients_with_intervals import Status
-from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, place_samples_and_temperature_on_grid
+from monitor.estimation.regular_grid import MAX_GAP_SAMPLES, place_samples_on_grid
 from tests.support.recordings import recorded_blocks, recordings, white
 
 
@@ -106,8 +106,8 @@ def test_periodic_loss_beside_a_line_lowers_no_limit_below_the_noise(every, line
 def test_very_long_gap_is_not_counted_among_the_short_gaps():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
-    *_, notes = place_samples_and_temperature_on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
-    assert "0.067 % of the samples are missing" in notes
+    grid = place_samples_on_grid(recorded_blocks(index / 100, white(5997)), 100.0)
+    assert "0.067 % of the samples are missing" in grid.notes_with_missing()
 
 
 def test_very_long_gap_takes_no_memory_and_no_term_crosses_it():

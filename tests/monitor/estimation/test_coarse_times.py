@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monitor.estimation.coarse_times import refine_coarse_times
-from monitor.estimation.regular_grid import place_samples_and_pauses_on_grid
+from monitor.estimation.regular_grid import place_samples_on_grid
 from tests.support.recordings import recorded_blocks, white
 
 SAMPLES = 20_000
@@ -23,39 +23,39 @@ def test_pauses_keep_their_length_and_position(seed):
         index[begin:] += round(at_stamp * rng.uniform(1.2, 300.0))
     t_s = index / rate_hz + rng.uniform(0.0, 100.0)
     blocks = recorded_blocks(np.floor(t_s / resolution_s + 1e-9) * resolution_s, white(SAMPLES), 1000)
-    values, pauses, found_hz, notes = place_samples_and_pauses_on_grid(blocks, None)
-    assert found_hz == pytest.approx(rate_hz, rel=0.002)
-    assert not pauses.size
-    assert f"times have a resolution of {resolution_s:.3g} s; equal time steps are assumed between pauses" in notes
-    rows = np.flatnonzero(~np.isnan(values[:, 0]))
-    assert len(values) == pytest.approx(index[-1] + 1, abs=6 + 4 * index[-1] / SAMPLES)
+    grid = place_samples_on_grid(blocks, None)
+    assert grid.rate_hz == pytest.approx(rate_hz, rel=0.002)
+    assert not grid.pauses.size
+    assert f"times have a resolution of {resolution_s:.3g} s; equal time steps are assumed between pauses" in grid.notes
+    rows = np.flatnonzero(~np.isnan(grid.values[:, 0]))
+    assert len(grid.values) == pytest.approx(index[-1] + 1, abs=6 + 4 * index[-1] / SAMPLES)
     assert np.abs(rows - index).max() <= 6 + 4 * index[-1] / SAMPLES
 
 
 def test_stamp_with_too_few_samples_has_lost_them():
     index = np.delete(np.arange(SAMPLES), np.arange(7_032, 7_061))
-    values, _, rate_hz, _ = place_samples_and_pauses_on_grid(recorded_blocks(np.floor(index / 100.0)), None)
-    assert rate_hz == 100.0
-    assert len(values) == SAMPLES
-    assert np.flatnonzero(np.isnan(values[:, 0])).tolist() == list(range(7_071, 7_100))
+    grid = place_samples_on_grid(recorded_blocks(np.floor(index / 100.0)), None)
+    assert grid.rate_hz == 100.0
+    assert len(grid.values) == SAMPLES
+    assert np.flatnonzero(np.isnan(grid.values[:, 0])).tolist() == list(range(7_071, 7_100))
 
 
 @pytest.mark.parametrize("loss", [0.01, 0.2])
 def test_random_loss_is_no_pause(loss):
     rng = np.random.default_rng(5)
     index = np.flatnonzero(rng.random(SAMPLES) > loss)
-    values, _, rate_hz, _ = place_samples_and_pauses_on_grid(recorded_blocks(np.floor(index / 100.0)), None)
-    assert rate_hz == pytest.approx(100.0 * (1.0 - loss), rel=0.02)
-    assert len(values) == pytest.approx(index.size, rel=1e-3)
+    grid = place_samples_on_grid(recorded_blocks(np.floor(index / 100.0)), None)
+    assert grid.rate_hz == pytest.approx(100.0 * (1.0 - loss), rel=0.02)
+    assert len(grid.values) == pytest.approx(index.size, rel=1e-3)
 
 
 def test_late_stamps_are_no_pause():
     """The sender reads its clock up to 30 ms late."""
     rng = np.random.default_rng(6)
     t_s = np.maximum.accumulate(np.floor(np.arange(SAMPLES) / 100.0 + 0.03 * rng.random(SAMPLES)))
-    values, _, rate_hz, _ = place_samples_and_pauses_on_grid(recorded_blocks(t_s), None)
-    assert rate_hz == pytest.approx(100.0, rel=1e-3)
-    assert len(values) == SAMPLES
+    grid = place_samples_on_grid(recorded_blocks(t_s), None)
+    assert grid.rate_hz == pytest.approx(100.0, rel=1e-3)
+    assert len(grid.values) == SAMPLES
 
 
 @pytest.mark.parametrize("kind", ["exact", "jitter", "repeated", "backwards", "constant", "short"])

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from drivers.errors import NotReady
-from monitor.estimation.regular_grid import MAX_CLOCK_NOTES, MAX_GAP_SAMPLES, place_samples_and_temperature_on_grid
+from monitor.estimation.regular_grid import MAX_CLOCK_NOTES, MAX_GAP_SAMPLES, place_samples_on_grid
 from tests.support.recordings import recorded_blocks, recordings, white
 
 
 def place_on_grid(blocks, rate_hz):
     """Return the values on the grid, the rate and the notes."""
-    values, _, rate, notes = place_samples_and_temperature_on_grid(blocks, rate_hz)
-    return values, rate, notes
+    grid = place_samples_on_grid(blocks, rate_hz)
+    return grid.values, grid.rate_hz, grid.notes_with_missing()
 
 
 @pytest.mark.parametrize("rate", [100.0, None])

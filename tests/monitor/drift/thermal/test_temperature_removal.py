@@ -22,7 +22,7 @@ SECONDS = 6 * 3600.0
 
 
 @pytest.fixture(scope="module")
-def analysis_and_temperature():
+def analysis():
     """Simulate gx with noise and temperature dependence, gy with noise and a random walk, and no other axes."""
     rng = np.random.default_rng(3)
     n = round(SECONDS * RATE_HZ)
@@ -33,13 +33,12 @@ def analysis_and_temperature():
     values[:, 0] += 3e-5 * (temperature_c - 25.0)
     values[:, 1] += 3e-6 / RATE_HZ**0.5 * rng.standard_normal(n).cumsum()
     samples = make_block(np.rint(1e9 * t).astype(np.int64), values, temperature_c)
-    return analyze([samples], RATE_HZ), temperature_c
+    return analyze([samples], RATE_HZ)
 
 
 @pytest.mark.long
-def test_temperature_effect_is_removed_and_other_drift_stays(analysis_and_temperature):
-    result, temperature_c = analysis_and_temperature
-    found = remove_temperature_effect(result, temperature_c)
+def test_temperature_effect_is_removed_and_other_drift_stays(analysis):
+    found = remove_temperature_effect(analysis)
     assert found.models["gx"] == "polynomial 1"
     k = SYMBOLS.index("K")
     assert found.before.status[k, 0] == found.before.status[k, 1] == Status.ESTIMATED
@@ -56,12 +55,11 @@ def test_temperature_effect_is_removed_and_other_drift_stays(analysis_and_temper
 
 
 @pytest.mark.long
-def test_unrelated_temperature_removes_nothing(analysis_and_temperature):
-    result, temperature_c = analysis_and_temperature
-    values = result.values.copy()
+def test_unrelated_temperature_removes_nothing(analysis):
+    values = analysis.values.copy()
     values[:, 0] = np.random.default_rng(4).standard_normal(len(values))
     values[:, 1] = np.nan
-    assert remove_temperature_effect(replace(result, values=values), temperature_c) is None
+    assert remove_temperature_effect(replace(analysis, values=values)) is None
 
 
 def test_constant_temperature_is_recognized():
