@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import (
     AXES,
+    NO_TICK,
     NS_PER_S,
     Floats,
     Ints,
@@ -104,9 +105,12 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
         Consecutive samples. If the recording contains no times, the sample times start at 0 and follow from the sample
         rate.
     """
-    for start in range(0, len(recording), rows):
+    t_ns, ticks = _times_ns(recording), np.full(min(rows, len(recording)), NO_TICK, np.int64)
+    for start in range(0, len(recording), rows):  # views, because many small arrays do not return to the system
         part = slice(start, min(start + rows, len(recording)))
-        yield make_block(_times_ns(recording, part), recording.values[part], recording.temperature_c[part])
+        yield make_block(
+            t_ns[part], recording.values[part], recording.temperature_c[part], ticks[: part.stop - part.start]
+        )
 
 
 def assemble_recording(path: Path, table: Table, rate_hz: float | None, options: ReadingOptions) -> Recording:
@@ -266,12 +270,12 @@ def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None
         notes.append(f"{count} values that are infinite or beyond {MAX_VALUE:g} were read as missing.")
 
 
-def _times_ns(recording: Recording, part: slice) -> Ints:
+def _times_ns(recording: Recording) -> Ints:
     if recording.times is not None:
-        return times_to_ns(recording.times[part])
+        return times_to_ns(recording.times)
     if recording.rate_hz is None:
         raise RecordingError("a recording needs times or a rate")
-    return times_to_ns(np.arange(part.start, part.stop) / recording.rate_hz)
+    return times_to_ns(np.arange(len(recording)) / recording.rate_hz)
 
 
 def take_last(found: Recording, last_s: float) -> Recording:
