@@ -8,6 +8,7 @@ This module imports rosbags, so only ``ros_bag_format`` imports this module, and
 """
 
 import os
+import re
 import struct
 import sys
 from bz2 import BZ2Decompressor
@@ -21,11 +22,12 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import apsw
 from lz4.frame import LZ4FrameDecompressor
 from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
 from drivers.errors import RecordingError
 from drivers.host.safe_file_reading import open_regular_file
@@ -63,6 +65,8 @@ MCAP_SCHEMA: Final = 0x03
 MCAP_CHUNK_INDEX: Final = 0x08
 MCAP_CHUNK_HEADER_BYTES: Final = 9 + 40
 """Bytes of a chunk record that precede the name of the compression and the messages."""
+IDL_HEADER: Final = re.compile(r"={80}\nIDL: .*\n")
+"""Lines before each definition of a schema with several definitions."""
 
 
 def iter_unpacked(file: IO[bytes], compression: str) -> Iterator[bytes]:
@@ -276,3 +280,29 @@ class Ros2Reader(rosbag2.Reader):
     STORAGE_PLUGINS: Mapping[str, Any] = {
         "dir": BoundedFolderReader, ".mcap": BoundedMcapReader, ".db3": BoundedSqlite3Reader
     }  # fmt: skip
+
+
+def list_fixed_fields(connection: Connection) -> tuple[tuple[str, str, int], ...]:
+    """Return the name, the type and the number of elements of each field of a message, or nothing if undefined.
+
+    Raises
+    ------
+    ValueError
+        If a field has no fixed size.
+    """
+    definition = connection.msgdef
+    if definition.format == MessageDefinitionFormat.NONE or not definition.data:
+        return ()
+    if definition.format == MessageDefinitionFormat.MSG:
+        types = get_types_from_msg(definition.data, connection.msgtype)
+    else:
+        types = {}
+        for idl in filter(None, IDL_HEADER.split(definition.data)):
+            types |= get_types_from_idl(idl)
+    fields = []
+    for name, (node, description) in types[connection.msgtype][1]:
+        (element, base), count = description if node == Nodetype.ARRAY else ((node, description), 0)
+        if element != Nodetype.BASE or base[0] == "string":
+            raise ValueError(f"the field {name} of {connection.msgtype} has no fixed size")
+        fields.append((name, base[0], count))
+    return tuple(fields)
