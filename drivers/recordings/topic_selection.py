@@ -24,6 +24,8 @@ BLOCK_ROWS: Final = 4096
 """Number of rows that are converted to arrays at once. As Python objects, a row needs about 400 bytes."""
 MAX_RATE_DIFFERENCE: Final = 0.1
 """Largest relative difference of the mean rates of two topics that are joined. Lost messages reduce a mean rate."""
+MIN_COMMON_SHARE: Final = 0.5
+"""Smallest share of the rows that a joined topic needs to contain."""
 HOW_TO_CHOOSE: Final = "choose with --topic (in a configuration file: topic)"
 
 
@@ -139,6 +141,12 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
         if any(axis in columns for axis in AXES):
             _check_equal_rates(path, {first: t_s, name: other_s})
             rows = _nearest_rows(t_s, other_s)
+            common = int(np.count_nonzero(rows >= 0))
+            if common < MIN_COMMON_SHARE * t_s.size:
+                raise ConfigError(
+                    f"{path}: only {common} of {t_s.size} samples of {first} have a sample of {name} at the same time, "
+                    f"so that they are not joined; {HOW_TO_CHOOSE} one of them"
+                )
         else:
             rows = _preceding_rows(t_s, other_s)
         for key, column in columns.items():
