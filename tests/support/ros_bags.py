@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import mcap.writer
 import numpy as np
 from rosbags import rosbag1, rosbag2
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -39,7 +40,8 @@ PX4: Final = {  # definitions of px4_msgs (release 1.14)
     "uint8 samples\nint16[32] x\nint16[32] y\nint16[32] z\n",
 }
 PX4["SensorAccel"] = PX4["SensorGyro"]
-KINDS: Final = (*ROS1, *ROS2)
+ROS1_MCAP: Final = "ros1-profile-mcap"
+KINDS: Final = (*ROS1, *ROS2, ROS1_MCAP)
 NOT_PROVIDED: Final = np.array([-1.0, *[0.0] * 8])
 
 MakeMessage = Callable[[Any, int], Any]
@@ -105,6 +107,8 @@ def px4_topic(kind: str, t_us: Ints, **fields: Any) -> tuple[str, Ints, MakeMess
 
 def write_bag(folder: Path, kind: str, topics: Topics, name: str = "run") -> Path:
     """Write a bag of one of KINDS, and return the file of a ROS 1 bag or the folder of a ROS 2 bag."""
+    if kind == ROS1_MCAP:
+        return _write_ros1_mcap(folder / f"{name}.mcap", topics)
     writer: Any
     if kind in ROS1:
         path, store = folder / f"{name}.bag", get_typestore(Stores.ROS1_NOETIC)
@@ -125,6 +129,25 @@ def write_bag(folder: Path, kind: str, topics: Topics, name: str = "run") -> Pat
         for log_ns, topic, i in _in_order(topics):
             type_name, _, make = topics[topic]
             writer.write(connections[topic], log_ns, serialize(make(store.types, i), type_name))
+    return path
+
+
+def _write_ros1_mcap(path: Path, topics: Topics) -> Path:
+    """Write messages of ROS 1 to an MCAP file, as ``mcap convert run.bag run.mcap``."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start(profile="ros1")
+        channels = {}
+        for topic, (type_name, _, _) in topics.items():
+            definition = store.generate_msgdef(type_name, ros_version=1)[0].encode()
+            schema = writer.register_schema(type_name.replace("/msg/", "/"), "ros1msg", definition)
+            channels[topic] = writer.register_channel(topic, "ros1", schema)
+        for log_ns, topic, i in _in_order(topics):
+            type_name, _, make = topics[topic]
+            data = bytes(store.serialize_ros1(make(store.types, i), type_name))
+            writer.add_message(channels[topic], log_ns, data, log_ns)
+        writer.finish()
     return path
 
 

@@ -1,4 +1,4 @@
-"""Read ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS 2 messages with the library rosbags.
+"""Read ROS 1 bags, ROS 2 bags (SQLite and MCAP) and MCAP files with ROS messages with the library rosbags.
 
 Topics of type ``sensor_msgs/Imu`` contain values in rad/s and m/s². If the first covariance of a quantity is -1, the
 message does not provide the quantity (sensor_msgs/Imu.msg). Topics of type ``sensor_msgs/Temperature`` contain values
@@ -126,7 +126,7 @@ def _open_bag(path: Path) -> Iterator[tuple[_Bag, memory_check.RecordingSizeLimi
     else:
         with readers.Ros2Reader(path) as bag2:
             topics = _list_topics(bag2.connections, {one.id: one.msgcount for one in bag2.connections})
-            yield _Bag(bag2.connections, topics, bag2.messages, cdr=True), limit
+            yield _Bag(bag2.connections, topics, bag2.messages, bag2.is_cdr), limit
 
 
 def _bag_errors(path: Path) -> AbstractContextManager[None]:
