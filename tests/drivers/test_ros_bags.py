@@ -186,7 +186,25 @@ class TestJoin:
             "/accel": imu_topic(times_ns(63, 63.0), noise(63)),
         }
         bag = write_bag(tmp_path, "sqlite", topics)
-        assert "mixed rates: /gyro 200 Hz and /accel 63 Hz" in load_refused(bag, "/gyro+/accel")
+        for topic in ("/gyro+/accel", None):
+            refused = load_refused(bag, topic)
+            assert "mixed rates: /gyro 200 Hz and /accel 63 Hz, and samples are never resampled" in refused
+            assert f"`imu-monitor analyze {bag} --topic /gyro --json 1.json`" in refused
+            assert f"`imu-monitor analyze {bag} --topic /accel --json 2.json`" in refused
+
+    @pytest.mark.parametrize("kind", ["ros1", "mcap"])
+    def test_a_camera_publishes_zeros_for_the_other_triad(self, kind: str, tmp_path: Path) -> None:
+        t_ns, gyro, accel = times_ns(50), noise(50, 1), noise(50, 2)
+        gyro[:, 3:] = accel[:, :3] = 0.0
+        names = ("/camera/gyro/sample", "/camera/accel/sample")
+        topics = {names[0]: imu_topic(t_ns, gyro), names[1]: imu_topic(t_ns + 1_000_000, accel)}
+        bag = write_bag(tmp_path, kind, topics)
+        both = load_samples(bag)
+        assert both.values.tobytes() == np.hstack([gyro[:, :3], accel[:, 3:]]).tobytes()
+        for name, axes in zip(names, (GYROS, ACCELS), strict=True):
+            alone = load_samples(bag, options=ReadingOptions(topic=name))
+            assert alone.axes == axes
+            assert f"The messages of {name} do not provide" in alone.notes[0]
 
     def test_a_temperature_applies_until_the_next(self, tmp_path: Path) -> None:
         t_ns = times_ns(50)
@@ -433,7 +451,7 @@ class TestMemory:
         (None, "run.mcap: contains 3 IMU topics: /left/imu, /right/imu, /slow/imu; choose with --topic"),
         ("/left/im", 'contains no topic "/left/im"; possible are /left/imu, '),
         ("/text", 'topic "/text" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu or'),
-        ("/left/imu+/slow/imu", "mixed rates: /left/imu 100 Hz and /slow/imu 50 Hz; only topics with equal rates"),
+        ("/left/imu+/slow/imu", "mixed rates: /left/imu 100 Hz and /slow/imu 50 Hz, and samples"),
         ("truncated", "run.mcap: is cut off: the end of the MCAP file is missing; `mcap recover run.mcap"),
         ("unindexed", "run.mcap: is not indexed; expected an MCAP file with a summary section"),
     ],

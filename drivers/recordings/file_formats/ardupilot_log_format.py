@@ -29,7 +29,7 @@ from drivers.errors import RecordingError, convert_library_errors
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topic_selection import BLOCK_ROWS, JOIN, RecordedTopic, join_topics, select_topics
+from drivers.recordings.topic_selection import BLOCK_ROWS, RecordedTopic, join_topics, pair_triads, select_topics
 
 MAGIC: Final = b"\xa3\x95\x80"
 """First bytes of a log: the start of a message, and the number of the message FMT."""
@@ -251,7 +251,7 @@ def _known_fields(messages: _Messages) -> dict[str, str]:
 def _list_imus(messages: Mapping[str, _Messages]) -> Sequence[Sequence[str]]:
     """Return the IMUs of a log. A gyroscope and an accelerometer with the same number form an IMU."""
     imus, gyros, accels = ([name for name in messages if name.startswith(kind)] for kind in ("IMU", "GYR", "ACC"))
-    pairs = [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if gyro[3:] == accel[3:]]
+    pairs = pair_triads(gyros, accels, lambda name: name[3:])
     batches = [[name for name, one in messages.items() if one.name == topic] for topic, _ in BATCH_TOPICS.values()]
     return [group for group in (imus, *([pairs] if pairs else [gyros, accels]), *batches) if group]
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Ints, Times
 from drivers.recordings import table
-from drivers.recordings.topic_selection import JOIN
+from drivers.recordings.topic_selection import pair_triads
 
 Fields = Mapping[str, NDArray[Any]]
 """Array [n] of each field of n messages. The name of an element of an array ends with its index, as in ``x[0]``."""
@@ -83,7 +83,7 @@ def list_imus(topics: Mapping[str, tuple[str, object]]) -> Sequence[Sequence[str
     combined, integrated, *separate = groups[:-1]
     found = [combined, integrated]
     for gyros, accels in zip(separate[::2], separate[1::2], strict=True):
-        pairs = [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if topics[gyro][1] == topics[accel][1]]
+        pairs = pair_triads(gyros, accels, lambda name: topics[name][1])
         found += [pairs] if pairs else [gyros, accels]
     return [group for group in found if group]
 

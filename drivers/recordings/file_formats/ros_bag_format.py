@@ -39,7 +39,7 @@ from drivers.recordings.file_formats.ros_message_arrays import (
     iter_message_blocks,
 )
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topic_selection import RecordedTopic, join_topics, select_topics
+from drivers.recordings.topic_selection import JOIN, RecordedTopic, join_topics, pair_triads, select_topics
 
 METADATA: Final = "metadata.yaml"
 """File that identifies a folder as a ROS 2 bag."""
@@ -108,6 +108,9 @@ class _Bag:
         """Return the names of the topics to read."""
         readable = {one.name: one.message_type for one in self.topics if one.rows}
         imus = [name for name, kind in readable.items() if kind == IMU_TYPE]
+        gyros, accels = ([name for name in imus if triad in name] for triad in ("gyro", "accel"))
+        pairs = pair_triads(gyros, accels, lambda name: TRIAD.sub("", name))
+        imus = [*pairs, *(name for name in imus if not any(name in pair.split(JOIN) for pair in pairs))]
         of_px4 = {name: (PX4_TYPES[kind], TRIAD.sub("", name)) for name, kind in readable.items() if kind in PX4_TYPES}
         return select_topics(path, self.topics, [*([imus] if imus else []), *list_imus(of_px4)], topic, EXPECTED, notes)
 
@@ -200,6 +203,8 @@ def _read_topic(bag: _Bag, name: str, limit: memory_check.RecordingSizeLimits, n
     if kind == IMU_TYPE:
         # The maximum is NaN only if all values are. A mask of all rows would need more memory.
         absent = [axis for axis in AXES if np.isnan(np.fmax.reduce(columns[axis]))]
+        zero = [axis for axis in AXES if axis not in absent and not columns[axis].any()]
+        absent += zero if zero in ([*AXES[:3]], [*AXES[3:]]) else []  # a camera publishes 0 for the other triad
         if absent:
             notes.append(f"The messages of {name} do not provide {' '.join(absent)}.")
         for axis in absent:
