@@ -318,9 +318,10 @@ def list_fixed_fields(connection: Connection) -> tuple[tuple[str, str, int], ...
         for idl in filter(None, IDL_HEADER.split(definition.data)):
             types |= get_types_from_idl(idl)
     fields = []
-    for name, (node, description) in types[connection.msgtype][1]:
+    for name, described in types[connection.msgtype][1]:
+        node, description = cast(tuple[Nodetype, Any], described)
         (element, base), count = description if node == Nodetype.ARRAY else ((node, description), 0)
         if element != Nodetype.BASE or base[0] == "string":
             raise ValueError(f"the field {name} of {connection.msgtype} has no fixed size")
-        fields.append((name, base[0], count))
+        fields.append((name, str(base[0]), int(count)))
     return tuple(fields)
