@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import NO_TICK, Chunk, Floats, Ints, SampleBlock, Timing, make_block
+from drivers.live_stream_check import LiveStreamCheck, StreamConfiguration
 
 MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""
@@ -134,13 +135,21 @@ class RecentRejection:
 class BlockBuilder:
     """Builder of sample blocks from decoded samples. A rejected frame ends the current block."""
 
-    def __init__(self) -> None:
+    def __init__(self, configuration: StreamConfiguration | None = None) -> None:
         self.bad = 0  # rejected frames and implausible samples so far
         self._missing = 0  # number of samples missing before the next block
+        self._check = None if configuration is None else LiveStreamCheck(configuration)
+
+    @property
+    def problem(self) -> str:
+        """Contradiction between the samples and the configuration; "" if there is none."""
+        return self._check.problem if self._check is not None else ""
 
     def forget_missing_samples(self) -> None:
-        """Reset the number of samples missing before the next sample block."""
+        """Reset the number of samples missing before the next sample block, and the check of the configuration."""
         self._missing = 0
+        if self._check is not None:
+            self._check.forget_samples()
 
     def build_plausible_blocks(
         self,
@@ -174,6 +183,8 @@ class BlockBuilder:
         block = self.build_block_if_all_plausible(t_ns, values, temperature_c, ticks, bad_before, bad_after)
         if block is not None:
             return [block]
+        if self.problem:
+            values = np.full_like(values, np.inf)
         n = t_ns.size
         temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
         good = _find_plausible(values)
@@ -212,9 +223,13 @@ class BlockBuilder:
     ) -> SampleBlock | None:
         """Build one block of all samples, or return None unless every value is measured and plausible, as usual.
 
-        The result is also None if frames were rejected before a sample. The parameters are those of
-        ``build_plausible_blocks``.
+        The result is also None if frames were rejected before a sample, or if the samples contradict the configuration.
+        The parameters are those of ``build_plausible_blocks``.
         """
+        if self._check is not None:
+            self._check.add_samples(t_ns, values)
+            if self._check.problem:
+                return None
         if not t_ns.size or (bad_before is not None and bad_before.any()) or not (np.abs(values) <= VALUE_LIMITS).all():
             return None
         temperature_c = None if temperature_c is None else _valid_temperatures(temperature_c)
@@ -451,8 +466,8 @@ class FrameBuffer:
 class RejectingDecoder:
     """Base class of decoders that reject frames and implausible samples."""
 
-    def __init__(self) -> None:
-        self._builder = BlockBuilder()
+    def __init__(self, configuration: StreamConfiguration | None = None) -> None:
+        self._builder = BlockBuilder(configuration)
         self._rejection = RecentRejection()
 
     @property
@@ -463,7 +478,7 @@ class RejectingDecoder:
     @property
     def recent_problem(self) -> str:
         """Reason why a frame was rejected; "" if no frame was rejected recently."""
-        return self._rejection.rejection_reason
+        return self._builder.problem or self._rejection.rejection_reason
 
 
 class FrameStreamDecoder(RejectingDecoder, ABC):

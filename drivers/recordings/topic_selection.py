@@ -4,9 +4,10 @@ A log of a robot or of an autopilot contains messages of many kinds. A topic is 
 as the ROS topic ``/imu/data`` or the second instance of the PX4 topic ``sensor_gyro``.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,8 @@ BLOCK_ROWS: Final = 4096
 """Number of rows that are converted to arrays at once. As Python objects, a row needs about 400 bytes."""
 MAX_RATE_DIFFERENCE: Final = 0.1
 """Largest relative difference of the mean rates of two topics that are joined. Lost messages reduce a mean rate."""
+MIN_COMMON_SHARE: Final = 0.5
+"""Smallest share of the rows that a joined topic needs to contain."""
 HOW_TO_CHOOSE: Final = "choose with --topic (in a configuration file: topic)"
 
 
@@ -112,6 +115,11 @@ def _find_topic(
     return topic
 
 
+def pair_triads(gyros: Sequence[str], accels: Sequence[str], sensor: Callable[[str], object]) -> list[str]:
+    """Return the joined names of gyroscopes and accelerometers of the same sensor. ``sensor`` tells it from a name."""
+    return [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if sensor(gyro) == sensor(accel)]
+
+
 def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
     """Join the columns of several topics.
 
@@ -139,6 +147,12 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
         if any(axis in columns for axis in AXES):
             _check_equal_rates(path, {first: t_s, name: other_s})
             rows = _nearest_rows(t_s, other_s)
+            common = int(np.count_nonzero(rows >= 0))
+            if common < MIN_COMMON_SHARE * t_s.size:
+                raise ConfigError(
+                    f"{path}: only {common} of {t_s.size} samples of {first} have a sample of {name} at the same time; "
+                    f"{_suggest_two_analyses(path, (first, name))}"
+                )
         else:
             rows = _preceding_rows(t_s, other_s)
         for key, column in columns.items():
@@ -153,8 +167,19 @@ def _check_equal_rates(path: Path, times: Mapping[str, Floats]) -> None:
     if max(rates.values()) > (1.0 + MAX_RATE_DIFFERENCE) * min(rates.values()):
         what = " and ".join(f"{name} {rate:.4g} Hz" for name, rate in rates.items())
         raise ConfigError(
-            f"{path}: mixed rates: {what}; only topics with equal rates can be joined; {HOW_TO_CHOOSE} one of them"
+            f"{path}: mixed rates: {what}, and samples are never resampled; {_suggest_two_analyses(path, rates)}"
         )
+
+
+def _suggest_two_analyses(path: Path, names: Iterable[str]) -> str:
+    commands = [
+        f"`imu-monitor analyze {quote(str(path))} --topic {quote(name)} --json {number}.json`"
+        for number, name in enumerate(names, 1)
+    ]
+    return (
+        f"read each topic with its own command: {' and '.join(commands)}; "
+        "`imu-monitor export 1.json 2.json --format kalibr` joins the results"
+    )
 
 
 def _nearest_rows(t: Floats, other: Floats) -> NDArray[np.intp]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Times
+from drivers.impossible_units import measure_rotation
 from drivers.recordings.column_names import KIND_OF, KINDS, UNSCALED
 from drivers.recordings.table import NO_TIME_NS, TIME_NS
 from drivers.units import DEGREE, G0, acceleration_factor, angular_rate_factor, time_factor
@@ -225,27 +226,6 @@ def _measure_warming(temperature: Times | None, parts: int = 8) -> float:
     size = temperature.size // parts
     means = np.nanmedian(temperature[: parts * size].reshape(parts, size), axis=1)
     return float(np.nanmax(np.abs(np.diff(means)), initial=0.0)) / size
-
-
-def measure_rotation(gyro: Floats | None, accel: Floats | None, rows: int = 32) -> float | None:
-    """Return the angle in rad per unit of angular rate and sample, or None if the sensor turns too little.
-
-    Gravity is at rest, so its direction in the sensor changes by minus the cross product of angle and direction.
-    """
-    if gyro is None or accel is None or gyro.shape[2] < 3 or accel.shape[2] < 3 or gyro.shape[1] < 4 * rows:
-        return None
-    count = gyro.shape[1] // rows
-    means = [np.nanmean(x[:, : count * rows].reshape(len(x), count, rows, 3), axis=2) for x in (gyro, accel)]
-    rates, up = means[0] - np.nanmedian(means[0], axis=(0, 1)), means[1]
-    up = up / np.maximum(np.linalg.norm(up, axis=2, keepdims=True), 1e-30)
-    expected = -np.cross(0.5 * (rates[:, 1:] + rates[:, :-1]), 0.5 * (up[:, 1:] + up[:, :-1])) * rows
-    changes = np.diff(up, axis=1)
-    used = np.isfinite(expected).all(axis=2) & np.isfinite(changes).all(axis=2)
-    x, y = expected[used].ravel(), changes[used].ravel()
-    if x.size < 10 or not np.any(x) or float(np.sqrt(np.mean(y**2))) < 0.02:
-        return None
-    correlation = float(x @ y / sqrt((x @ x) * (y @ y)))
-    return float(x @ y / (x @ x)) if correlation > 0.7 else None
 
 
 # --- hypotheses ----------------------------------------------------------------------------------

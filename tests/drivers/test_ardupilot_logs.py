@@ -12,7 +12,7 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from drivers.recordings.file_formats import ardupilot_log_format
-from tests.support.dataflash import Messages, dataflash_bytes, imu, raw_sensor, table_of, write_dataflash
+from tests.support.dataflash import Messages, batches, dataflash_bytes, imu, raw_sensor, table_of, write_dataflash
 from tests.support.recordings import float32_noise, load_damaged, load_refused, recordings
 
 GYROS, ACCELS = AXES[:3], AXES[3:]
@@ -85,6 +85,66 @@ class TestSamples:
         np.testing.assert_allclose(found.t_s, flights[number - 1][0], rtol=0.0, atol=1e-6)
 
 
+class TestBatches:
+    """Batches of 64 samples at 1000 Hz, which begin every second. Those of the accelerometer begin 0.5 s later."""
+
+    STARTS_US = 7_000_000 + 1_000_000 * np.arange(5)
+    RATE_HZ = 1000.0
+
+    def logs(self, instance: int = 0) -> tuple[np.ndarray[Any, Any], tuple[Messages, ...]]:
+        """Return the counts [2, 5, 64, 3] of gyroscope and accelerometer, and the messages of the autopilot."""
+        counts = np.random.default_rng(instance).integers(-2000, 2000, (2, 5, 64, 3))
+        header = {"instance": instance, "smp_rate": self.RATE_HZ}
+        first = 65_530 + 100 * instance
+        gyro = batches(1, self.STARTS_US, counts[0], first, mul=938, **header)
+        accel = batches(0, self.STARTS_US + 500_000, counts[1], first + 50, mul=208, **header)
+        return counts, (*gyro, *accel)
+
+    def test_batches_are_pieces_with_gaps(self, tmp_path: Path) -> None:
+        """The numbers of the batches start again at 0."""
+        counts, messages = self.logs()
+        path = write_dataflash(tmp_path / "x.bin", *messages)
+        expected_us = (self.STARTS_US[:, None] + 1000 * np.arange(64)).ravel()
+        for topic, i, scale, axes, shift_us in (("ISBD_GYR", 0, 938, GYROS, 0), ("ISBD_ACC", 1, 208, ACCELS, 500_000)):
+            found = load_samples(path, options=ReadingOptions(topic=topic))
+            assert found.axes == axes
+            assert found.t_ns is not None
+            assert found.t_ns.tolist() == (1000 * (expected_us + shift_us)).tolist()
+            np.testing.assert_array_equal(found.values[:, 3 * i : 3 * i + 3], counts[i].reshape(-1, 3) / scale)
+
+    def test_the_continuous_messages_are_read_first(self, tmp_path: Path) -> None:
+        path = write_dataflash(tmp_path / "x.bin", imu(times_us(300), float32_noise(300)), *self.logs()[1])
+        found = load_samples(path)
+        assert found.values.tobytes() == float32_noise(300).tobytes()
+        assert found.notes == ("Topic IMU is read; the file also contains ISBD_GYR, ISBD_ACC.",)
+
+    def test_batches_of_two_sensors_are_listed(self, tmp_path: Path) -> None:
+        path = write_dataflash(tmp_path / "x.bin", *self.logs()[1], *self.logs(1)[1])
+        listed = "ISBD_GYR, ISBD_GYR:1, ISBD_ACC, ISBD_ACC:1"
+        assert f"contains 4 IMU topics: {listed}; choose with --topic" in load_refused(path)
+        found = load_samples(path, options=ReadingOptions(topic="ISBD_ACC:1"))
+        np.testing.assert_array_equal(found.values[:, 3:], self.logs(1)[0][1].reshape(-1, 3) / 208)
+
+    def test_batches_of_both_triads_are_not_joined(self, tmp_path: Path) -> None:
+        """The autopilot records the triads one after the other."""
+        path = write_dataflash(tmp_path / "x.bin", *self.logs()[1])
+        refused = load_refused(path, "ISBD_GYR+ISBD_ACC")
+        assert "only 0 of 320 samples of ISBD_GYR have a sample of ISBD_ACC at the same time" in refused
+
+    def test_lost_messages_leave_gaps_and_no_wrong_samples(self, tmp_path: Path) -> None:
+        counts, (headers, samples, *_) = self.logs()
+        kept_headers, kept = np.arange(5) != 2, np.arange(10) != 1
+        path = write_dataflash(
+            tmp_path / "x.bin", Messages("ISBH", headers.rows[kept_headers]), Messages("ISBD", samples.rows[kept])
+        )
+        found = load_samples(path)
+        rows = np.delete(np.arange(320), [*range(32, 64), *range(128, 192)])
+        np.testing.assert_array_equal(found.values[:, :3], counts[0].reshape(-1, 3)[rows] / 938)
+        assert found.t_ns is not None
+        expected_us = (self.STARTS_US[:, None] + 1000 * np.arange(64)).ravel()
+        assert found.t_ns.tolist() == (1000 * expected_us[rows]).tolist()
+
+
 class TestTopics:
     def test_two_imus_are_listed(self, tmp_path: Path) -> None:
         path = write_dataflash(tmp_path / "x.bin", *(imu(times_us(30), float32_noise(30, i), i) for i in range(2)))
@@ -114,7 +174,7 @@ class TestTopics:
         rows = table_of(TimeUS=times_us(3).astype("<u8"), Alt=np.ones(3, "<f4"))
         path = write_dataflash(tmp_path / "x.bin", Messages("BARO", rows))
         assert load_refused(path).endswith(
-            "contains no samples of an IMU; expected messages IMU, or GYR and ACC, found no messages"
+            "contains no samples of an IMU; expected messages IMU, GYR and ACC, or ISBH and ISBD, found no messages"
         )
 
 
@@ -136,9 +196,8 @@ class TestDamage:
         self, tmp_path: Path, capfd: pytest.CaptureFixture[str]
     ) -> None:
         rng = np.random.default_rng(5)
-        data = dataflash_bytes(
-            [imu(times_us(40), float32_noise(40)), raw_sensor("GYR", times_us(40), float32_noise(40)[:, :3], 1)]
-        )
+        raw = batches(1, times_us(2), rng.integers(-9, 9, (2, 32, 3)), 0, instance=0, mul=900, smp_rate=1000.0)
+        data = dataflash_bytes([*raw, raw_sensor("GYR", times_us(40), float32_noise(40)[:, :3], 1)])
         for _ in range(300):
             damaged = bytearray(data)
             for at in rng.integers(3, len(data) // (1 + rng.integers(8)), 3):

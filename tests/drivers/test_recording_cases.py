@@ -4,7 +4,6 @@ Each file has the peculiarity of its source. Unless stated otherwise, each axis 
 m/s² at 100 Hz, so the random walks are 0.300 °/√h and 0.0600 m/s/√h.
 """
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -171,13 +170,6 @@ def test_needed_columns_are_not_hidden(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text(",".join(names) + "\n" + ",".join("1" * len(names)) + "\n")
     with pytest.raises(RecordingError, match=r"flag_39, p, q, r\)"):
         load_samples(tmp_path / "x.csv")
-
-
-def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
-    head = struct.pack("<BQI4sI", 1, 12, 4, b"ros1", 0)
-    (tmp_path / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + head + bytes(100) + b"\x89MCAP0\r\n")
-    with pytest.raises(RecordingError, match=r"contains messages of ROS 1 in MCAP, .* read the bag \(.bag\)"):
-        load_samples(tmp_path / "x.mcap")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])

@@ -3,6 +3,7 @@
 import bz2
 import contextlib
 import os
+import sqlite3
 import struct
 import tracemalloc
 from pathlib import Path
@@ -18,8 +19,17 @@ from drivers.links import replay_link
 from drivers.recordings import ReadingOptions, load_samples, memory_check, save_samples
 from drivers.recordings.file_formats import ros_bag_format, ros_bag_readers
 from tests.support.program import exit_status
-from tests.support.recordings import load_damaged, load_refused
-from tests.support.ros_bags import KINDS, imu_topic, storage_file, temperature_topic, text_topic, write_bag
+from tests.support.recordings import float32_noise, load_damaged, load_refused
+from tests.support.ros_bags import (
+    KINDS,
+    MakeMessage,
+    imu_topic,
+    px4_topic,
+    storage_file,
+    temperature_topic,
+    text_topic,
+    write_bag,
+)
 
 START_NS = 1_763_700_000_123_456_789
 GYROS, ACCELS = AXES[:3], AXES[3:]
@@ -131,14 +141,16 @@ class TestTopics:
         topics = {"/imu": imu_topic(times_ns(5), noise(5)), "/odom": text_topic(times_ns(5))}
         bag = write_bag(tmp_path, "sqlite", topics)
         assert load_refused(bag, "/odom").endswith(
-            'topic "/odom" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu; possible are /imu'
+            'topic "/odom" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu or '
+            "px4_msgs/SensorCombined; possible are /imu"
         )
 
     def test_no_imu_at_all(self, kind: str, tmp_path: Path) -> None:
         bag = write_bag(tmp_path, kind, {"/odom": text_topic(times_ns(5))})
-        said = "contains no samples of an IMU; expected messages of type sensor_msgs/Imu, found /odom"
+        expected = "messages of type sensor_msgs/Imu or px4_msgs/SensorCombined"
+        said = f"contains no samples of an IMU; expected {expected}, found /odom"
         assert load_refused(bag).endswith(f"{said} (std_msgs/msg/String)")
-        assert load_refused(bag, "/odom").endswith("expected messages of type sensor_msgs/Imu")
+        assert load_refused(bag, "/odom").endswith(f"expected {expected}")
 
     def test_a_bag_without_messages(self, tmp_path: Path) -> None:
         bag = write_bag(tmp_path, "mcap", {"/imu": imu_topic(times_ns(0), noise(0)), "/a": text_topic(times_ns(3))})
@@ -174,7 +186,25 @@ class TestJoin:
             "/accel": imu_topic(times_ns(63, 63.0), noise(63)),
         }
         bag = write_bag(tmp_path, "sqlite", topics)
-        assert "mixed rates: /gyro 200 Hz and /accel 63 Hz" in load_refused(bag, "/gyro+/accel")
+        for topic in ("/gyro+/accel", None):
+            refused = load_refused(bag, topic)
+            assert "mixed rates: /gyro 200 Hz and /accel 63 Hz, and samples are never resampled" in refused
+            assert f"`imu-monitor analyze {bag} --topic /gyro --json 1.json`" in refused
+            assert f"`imu-monitor analyze {bag} --topic /accel --json 2.json`" in refused
+
+    @pytest.mark.parametrize("kind", ["ros1", "mcap"])
+    def test_a_camera_publishes_zeros_for_the_other_triad(self, kind: str, tmp_path: Path) -> None:
+        t_ns, gyro, accel = times_ns(50), noise(50, 1), noise(50, 2)
+        gyro[:, 3:] = accel[:, :3] = 0.0
+        names = ("/camera/gyro/sample", "/camera/accel/sample")
+        topics = {names[0]: imu_topic(t_ns, gyro), names[1]: imu_topic(t_ns + 1_000_000, accel)}
+        bag = write_bag(tmp_path, kind, topics)
+        both = load_samples(bag)
+        assert both.values.tobytes() == np.hstack([gyro[:, :3], accel[:, 3:]]).tobytes()
+        for name, axes in zip(names, (GYROS, ACCELS), strict=True):
+            alone = load_samples(bag, options=ReadingOptions(topic=name))
+            assert alone.axes == axes
+            assert f"The messages of {name} do not provide" in alone.notes[0]
 
     def test_a_temperature_applies_until_the_next(self, tmp_path: Path) -> None:
         t_ns = times_ns(50)
@@ -190,6 +220,90 @@ class TestJoin:
         topics = {"/imu": imu_topic(times_ns(9), noise(9)), "/warm": temperature_topic(times_ns(9), np.ones(9))}
         bag = write_bag(tmp_path, "ros1", topics)
         assert load_refused(bag, "/warm").endswith("add one, as in --topic /imu+/warm")
+
+
+class TestPx4:
+    """Messages of PX4, whose definitions are in the bag."""
+
+    T_US = times_ns(300, 250.0) // 1000
+
+    @pytest.mark.parametrize("kind", ["sqlite", "sqlite-message", "mcap", "mcap-chunk"])
+    def test_sensor_combined(self, kind: str, tmp_path: Path) -> None:
+        values = float32_noise(300)
+        relative = np.where(np.arange(300) == 7, 0x7FFFFFFF, 0)
+        fields = {"gyro_rad": values[:, :3].astype("f4"), "accelerometer_m_s2": values[:, 3:].astype("f4")}
+        topic = px4_topic("SensorCombined", self.T_US, **fields, accelerometer_timestamp_relative=relative)
+        found = load_samples(write_bag(tmp_path, kind, {"/fmu/out/sensor_combined": topic}))
+        values[7, 3:] = np.nan
+        assert found.values.tobytes() == values.tobytes()
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == (1000 * self.T_US).tolist()
+        assert (found.axes, found.notes) == (AXES, ())
+
+    def test_integrals_become_rates_at_the_time_of_the_sample(self, tmp_path: Path) -> None:
+        """The integration times of the gyroscope and of the accelerometer differ."""
+        values = float32_noise(300)
+        integrals = {
+            name: (part * dt_us * 1e-6).astype("f4")
+            for name, part, dt_us in (("delta_angle", values[:, :3], 4000), ("delta_velocity", values[:, 3:], 3750))
+        }
+        intervals = {"delta_angle_dt": np.full(300, 4000), "delta_velocity_dt": np.full(300, 3750)}
+        topic = px4_topic("VehicleImu", self.T_US + 500, timestamp_sample=self.T_US, **integrals, **intervals)
+        found = load_samples(write_bag(tmp_path, "mcap", {"/fmu/out/vehicle_imu": topic}))
+        np.testing.assert_allclose(found.values, values, rtol=2e-7, atol=0.0)
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == (1000 * self.T_US).tolist()
+
+    def test_gyroscopes_and_accelerometers_of_two_sensors(self, tmp_path: Path) -> None:
+        topics = {}
+        for i in range(2):
+            for kind, part in (("SensorGyro", slice(3)), ("SensorAccel", slice(3, 6))):
+                xyz = dict(zip("xyz", float32_noise(300, i)[:, part].astype("f4").T, strict=True))
+                warm = {"timestamp_sample": self.T_US, "temperature": np.full(300, 40.0 + i)}
+                topics[f"/{kind.lower()}{i}"] = px4_topic(kind, self.T_US, **xyz, **warm)
+        bag = write_bag(tmp_path, "mcap", topics)
+        pairs = [f"/sensorgyro{i}+/sensoraccel{i}" for i in range(2)]
+        assert f"contains 2 IMU topics: {', '.join(pairs)}; choose with --topic" in load_refused(bag)
+        found = load_samples(bag, options=ReadingOptions(topic=pairs[1]))
+        assert found.values.tobytes() == float32_noise(300, 1).tobytes()
+        assert set(found.temperature_c) == {41.0}
+
+    def test_batches_become_samples(self, tmp_path: Path) -> None:
+        counts = np.random.default_rng(3).integers(-300, 300, (3200, 3))
+        t_us = self.T_US[0] + 125 * np.arange(3200)
+        xyz = {name: counts[:, i].reshape(100, 32).astype("i2") for i, name in enumerate("xyz")}
+        sizes = {"samples": np.full(100, 32), "dt": np.full(100, 125.0), "scale": np.full(100, 2.0**-10)}
+        topic = px4_topic("SensorGyroFifo", t_us[31::32] + 90, timestamp_sample=t_us[31::32], **xyz, **sizes)
+        found = load_samples(write_bag(tmp_path, "mcap", {"/fmu/out/sensor_gyro_fifo": topic}))
+        assert found.axes == GYROS
+        np.testing.assert_array_equal(found.values[:, :3], counts * 2.0**-10)
+        assert found.t_ns is not None
+        assert found.t_ns.tolist() == (1000 * t_us).tolist()
+
+    def test_without_a_definition_the_line_names_the_remedy(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "sqlite", {"/fmu/out/sensor_combined": self._any_topic()})
+        with contextlib.closing(sqlite3.connect(storage_file(bag))) as database, database:
+            database.execute("DELETE FROM message_definitions")
+        refused = load_refused(bag)
+        assert "contains no definition of px4_msgs/msg/SensorCombined; in a workspace with px4_msgs" in refused
+        assert "storage_id: mcap, topics: [/fmu/out/sensor_combined]" in refused
+
+    def test_messages_that_do_not_fit_their_definition(self, tmp_path: Path) -> None:
+        bag = write_bag(tmp_path, "sqlite", {"/imu": self._any_topic()})
+        with contextlib.closing(sqlite3.connect(storage_file(bag))) as database, database:
+            database.execute(
+                "UPDATE message_definitions SET encoded_message_definition = "
+                "encoded_message_definition || 'float32[3] added' || char(10)"
+            )
+        assert (
+            "topic /imu: a message has 52 bytes, expected 64 according to the definition in the bag; record it with"
+            in load_refused(bag)
+        )
+
+    def _any_topic(self) -> tuple[str, np.ndarray, MakeMessage]:
+        values = float32_noise(300).astype("f4")
+        fields = {"gyro_rad": values[:, :3], "accelerometer_m_s2": values[:, 3:]}
+        return px4_topic("SensorCombined", self.T_US, **fields)
 
 
 class TestDamage:
@@ -336,8 +450,8 @@ class TestMemory:
     [
         (None, "run.mcap: contains 3 IMU topics: /left/imu, /right/imu, /slow/imu; choose with --topic"),
         ("/left/im", 'contains no topic "/left/im"; possible are /left/imu, '),
-        ("/text", 'topic "/text" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu; possible'),
-        ("/left/imu+/slow/imu", "mixed rates: /left/imu 100 Hz and /slow/imu 50 Hz; only topics with equal rates"),
+        ("/text", 'topic "/text" contains std_msgs/msg/String, expected messages of type sensor_msgs/Imu or'),
+        ("/left/imu+/slow/imu", "mixed rates: /left/imu 100 Hz and /slow/imu 50 Hz, and samples"),
         ("truncated", "run.mcap: is cut off: the end of the MCAP file is missing; `mcap recover run.mcap"),
         ("unindexed", "run.mcap: is not indexed; expected an MCAP file with a summary section"),
     ],

@@ -12,7 +12,7 @@ HEAD: Final = b"\xa3\x95"
 FMT: Final = 0x80
 FMT_LAYOUT: Final = struct.Struct("<BB4s16s64s")  # number, length, name, format, names of the fields
 FIRST_NUMBER: Final = 0x81
-CODES: Final = {"f4": "f", "u8": "Q", "u4": "I", "u1": "B", "i2": "h"}
+CODES: Final = {"f4": "f", "u8": "Q", "u4": "I", "u2": "H", "u1": "B", "i2": "h", "S64": "a"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,3 +82,45 @@ def raw_sensor(name: str, t_us: np.ndarray[Any, Any], values: np.ndarray[Any, An
             **dict(zip(fields, values.astype("<f4").T, strict=True)),
         ),
     )
+
+
+def batches(
+    kind: int, starts_us: np.ndarray[Any, Any], counts: np.ndarray[Any, Any], first_number: int, **header: float
+) -> tuple[Messages, Messages]:
+    """Return messages ISBH and ISBD with batches of counts [batches, samples, 3].
+
+    Parameters
+    ----------
+    kind
+        0 for an accelerometer, 1 for a gyroscope.
+    starts_us
+        Times of the first samples.
+    counts
+        Counts; the number of samples is divisible by 32.
+    first_number
+        Number of the first batch.
+    header
+        Fields ``instance``, ``mul`` and ``smp_rate`` of ISBH.
+    """
+    n, size, _ = counts.shape
+    numbers = (first_number + np.arange(n)).astype("u2")
+    written_us = (starts_us + size * 1_000_000 / header["smp_rate"]).astype("u8")  # after the last sample
+    described = table_of(
+        TimeUS=written_us,
+        N=numbers,
+        type=np.full(n, kind, "u1"),
+        instance=np.full(n, header["instance"], "u1"),
+        mul=np.full(n, header["mul"], "u2"),
+        smp_cnt=np.full(n, size, "u2"),
+        SampleUS=starts_us.astype("u8"),
+        smp_rate=np.full(n, header["smp_rate"], "f4"),
+    )
+    parts = size // 32
+    xyz = counts.astype("<i2").reshape(n * parts, 32, 3)
+    samples = table_of(
+        TimeUS=(written_us[:, None] + np.arange(1, parts + 1, dtype="u8")).ravel(),
+        N=np.repeat(numbers, parts),
+        seqno=np.tile(np.arange(parts), n).astype("u2"),
+        **{name: np.ascontiguousarray(xyz[:, :, i]).view("S64")[:, 0] for i, name in enumerate("xyz")},
+    )
+    return Messages("ISBH", described), Messages("ISBD", samples)

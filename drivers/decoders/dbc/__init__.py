@@ -13,7 +13,7 @@ axis is marked as not measured. For 16-bit values, this part is 0xFE00 to 0xFFFF
 treated in the same way if ``not_available = true``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
@@ -24,9 +24,11 @@ from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import ConfiguredDbcMessages
 from drivers.decoders.dbc.sample_assembly import CanMessage, ReceivedSampleFrames, SampleAssembler
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
+from drivers.live_stream_check import StreamConfiguration
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 
+TRIADS: Final = {"gyro": AXES[:3], "accel": AXES[3:]}
 MAX_CACHED_IDS: Final = 4096
 """Maximum number of cached 29-bit identifiers. The limit prevents corrupted identifiers from filling the memory."""
 
@@ -42,11 +44,19 @@ class DbcDecoder:
         Settings of the decoder.
     timing
         Source of the sample times.
+    configuration
+        Units of the samples. None if they are not checked.
     """
 
     carrier: ClassVar[str] = "frames"
 
-    def __init__(self, messages: Sequence[CanMessage], settings: Settings, timing: Timing) -> None:
+    def __init__(
+        self,
+        messages: Sequence[CanMessage],
+        settings: Settings,
+        timing: Timing,
+        configuration: StreamConfiguration | None = None,
+    ) -> None:
         slow = [m for m in messages if m.contains_only_temperature and len(messages) > 1]
         self._slow = slow[0] if slow else None
         self._messages = [m for m in messages if m is not self._slow]
@@ -59,7 +69,7 @@ class DbcDecoder:
         self.recent_problem = ""
         self._two_senders_hint = ""  # message if two senders use the same parameter groups
         self._samples_since_reject = 0  # number of valid samples since the last rejected sample
-        self._builder = BlockBuilder()
+        self._builder = BlockBuilder(configuration)
         self._assembler = SampleAssembler(self._messages, settings)
         self._known = {m.address: i for i, m in self._numbered_messages() if not m.j1939}
         self._groups = {_parameter_group(m.frame_id): i for i, m in self._numbered_messages() if m.j1939}
@@ -108,7 +118,7 @@ class DbcDecoder:
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
-        self.recent_problem = self._two_senders_hint or self.recent_problem
+        self.recent_problem = self._builder.problem or self._two_senders_hint or self.recent_problem
         self._dropped, self.dropped_late_samples = self._builder.bad, self._assembler.dropped_late_samples
         self.bad = self._dropped - self.dropped_late_samples
         return blocks
@@ -201,6 +211,21 @@ class DbcDecoder:
         )
 
 
+def _describe_configuration(units: Mapping[str, str]) -> StreamConfiguration:
+    """Return what the DBC file and the settings state about the samples. ``units`` contains the unit of each axis."""
+
+    def unit_of(axes: Sequence[str], si_unit: str) -> str:
+        given = {units[axis] for axis in axes if axis in units}
+        return given.pop() if len(given) == 1 else si_unit
+
+    return StreamConfiguration(
+        (unit_of(TRIADS["gyro"], "rad/s"), unit_of(TRIADS["accel"], "m/s²")),
+        (True, True),
+        lambda found: f"set unit = {found.fits} for {' '.join(TRIADS[found.triad])} in `signals`",
+        "assign the messages of one sensor in `signals`, or choose its `channel` or `source`",
+    )
+
+
 def _stack_frames(done: Sequence[ReceivedSampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
@@ -223,4 +248,5 @@ def build(settings: Settings) -> Decoder:
         If the settings contain mistakes. The error has one line for each mistake.
     """
     database = ConfiguredDbcMessages(settings)
-    return DbcDecoder(database.messages_with_configured_signals, settings, database.timing)
+    configuration = _describe_configuration(database.units)
+    return DbcDecoder(database.messages_with_configured_signals, settings, database.timing, configuration)

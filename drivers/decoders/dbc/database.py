@@ -44,6 +44,8 @@ class ConfiguredDbcMessages:
         self._settings = settings
         self._errors: list[str] = []
         self._used: dict[str, CanMessage] = {}
+        self.units: dict[str, str] = {}
+        """Unit of each axis."""
         self.timing: Timing = ArrivalTimedFormat()
         """Timing of the samples."""
         with self._collecting():
@@ -114,6 +116,7 @@ class ConfiguredDbcMessages:
             else:
                 look_up = units.angular_rate_factor if axis.startswith("g") else units.acceleration_factor
                 factor, offset = look_up(unit), 0.0
+                self.units[axis] = unit
         except ConfigError as error:
             where = "" if entry.unit else f" (the unit in {self._path.name})"
             counts = f'{axis} = {{ signal = "{entry.signal}", unit = "…", factor = 0.0305 }}'

@@ -15,6 +15,7 @@ import numpy as np
 from drivers.data_types import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
+from drivers.live_stream_check import configure_si_messages
 from drivers.validation.settings_model import SettingsModel
 from drivers.zenoh.rmw_attachment import GID_BYTES, SEQUENCE_OFFSETS, encode_attachment
 from drivers.zenoh.ros2_imu_message import (
@@ -53,7 +54,7 @@ class Ros2ImuDecoder(RejectingDecoder):
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(configure_si_messages("subscribe to the key of one sensor"))
         self.timing: Timing = SenderTimedFormat()
         self._rejected = 0  # number of rejected messages
         self._lost_in_builder = 0  # number of lost messages that ``BlockBuilder`` has counted as bad

@@ -13,6 +13,7 @@ from typing import ClassVar, Final
 from drivers.data_types import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
+from drivers.live_stream_check import configure_si_messages
 from drivers.validation.settings_model import SettingsModel
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
@@ -30,7 +31,7 @@ class SamplesDecoder(RejectingDecoder):
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(configure_si_messages("subscribe to the key of one sensor"))
         self.timing: Timing = SenderTimedFormat()
         self._rejected = 0  # number of rejected messages
         self._received: int | None = None  # total number of samples according to the last message

@@ -5,6 +5,9 @@ m/s² and °C (ArduPilot, page "Onboard Message Log Messages"):
 
 - ``IMU`` contains the gyroscope, the accelerometer and the temperature.
 - ``GYR`` and ``ACC`` contain raw samples of one sensor. Their field ``SampleUS`` is the time of the sample.
+- ``ISBH`` and ``ISBD`` contain batches of raw samples of one triad in counts, at the rate of the sensor. The message
+  ISBH describes a batch, and each of the following messages ISBD contains 32 samples. The autopilot records the batches
+  of all triads in turn (AP_InertialSensor, class BatchSampler).
 
 The field ``I`` is the number of the sensor. Logs of older versions use other names instead, such as ``IMU2`` or
 ``GYR1``.
@@ -26,7 +29,7 @@ from drivers.errors import RecordingError, convert_library_errors
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.topic_selection import BLOCK_ROWS, JOIN, RecordedTopic, join_topics, select_topics
+from drivers.recordings.topic_selection import BLOCK_ROWS, RecordedTopic, join_topics, pair_triads, select_topics
 
 MAGIC: Final = b"\xa3\x95\x80"
 """First bytes of a log: the start of a message, and the number of the message FMT."""
@@ -48,7 +51,13 @@ MIN_MESSAGE_BYTES: Final = 20
 """Size of a typical short message in bytes, from which the number of messages is estimated."""
 MAX_TRAILING_BYTES: Final = 528
 """Maximum size of the unused end of a log. pymavlink uses the same limit, which is more than two flash pages."""
-EXPECTED: Final = "messages IMU, or GYR and ACC"
+BATCH_TOPICS: Final = {1: ("ISBD_GYR", AXES[:3]), 0: ("ISBD_ACC", AXES[3:])}
+"""Name and columns of the topics with batches, for each value of the field ``type`` of ISBH."""
+BATCH_SIZE: Final = 32
+"""Number of samples in a message ISBD."""
+MIN_BATCH_RATE_HZ: Final = 1.0
+"""Sample rate below which a message ISBH is damaged."""
+EXPECTED: Final = "messages IMU, GYR and ACC, or ISBH and ISBD"
 
 
 def is_ardupilot_log(path: Path) -> bool:
@@ -83,7 +92,7 @@ def read_ardupilot_log(path: Path, topic: str | None) -> table.Table:
     with _pymavlink_errors(path), _open_log(path, limit) as log:
         messages = _list_messages(log)
         names = _select(path, messages, topic, notes)
-        limit.check_row_count(sum(messages[name].offsets.size for name in names))
+        limit.check_row_count(sum(messages[name].rows for name in names))
         tables = {name: _read_columns(log, messages[name]) for name in names}
         if (end := _end_of_messages(log)) < log.data_len - MAX_TRAILING_BYTES:
             notes.append(f"The log is damaged at byte {end} of {log.data_len} and was read up to there.")
@@ -151,17 +160,26 @@ class _Messages:
     offsets: Ints  # [n] positions in the file
     layout: np.dtype[Any]
     factors: Mapping[str, float]  # factor of each field that is a fixed-point number
+    batches: np.ndarray[Any, np.dtype[np.void]] | None = None  # [n] ISBH of each message, if these are ISBD
+
+    @property
+    def rows(self) -> int:
+        return self.offsets.size * (1 if self.batches is None else BATCH_SIZE)
 
 
 def _list_messages(log: Any) -> dict[str, _Messages]:
     """Return the messages of each sensor of a log by the name of the topic."""
     found: dict[str, _Messages] = {}
+    batches: dict[str, _Messages] = {}
     for form in log.formats.values():
         offsets = np.array(log.offsets[form.type], np.int64)
         offsets = offsets[offsets + form.len <= log.data_len]
-        if not NAME.fullmatch(form.name) or not offsets.size:
+        if not offsets.size or not (NAME.fullmatch(form.name) or form.name in ("ISBH", "ISBD")):
             continue
         one = _Messages(form.name, offsets, _layout(form), _factors(form))
+        if not NAME.fullmatch(form.name):
+            batches[form.name] = one
+            continue
         if INSTANCE not in form.columns:
             found[form.name] = one
             continue
@@ -169,7 +187,30 @@ def _list_messages(log: Any) -> dict[str, _Messages]:
         for number in np.unique(numbers):
             name = f"{form.name}:{number}" if number else form.name
             found[name] = _Messages(form.name, offsets[numbers == number], one.layout, one.factors)
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items())) | (
+        _list_batches(log, batches["ISBH"], batches["ISBD"]) if len(batches) == 2 else {}
+    )
+
+
+def _list_batches(log: Any, descriptions: _Messages, samples: _Messages) -> dict[str, _Messages]:
+    """Return the messages ISBD of each triad. Messages without a usable description are left out."""
+    headers = np.concatenate(list(_iter_blocks(log, descriptions)))
+    numbers = np.concatenate([block["N"] for block in _iter_blocks(log, samples)])
+    order = np.lexsort((descriptions.offsets, headers["N"]))
+    headers, described = headers[order], descriptions.offsets[order] + (headers["N"][order].astype(np.int64) << 47)
+    preceding = np.searchsorted(described, samples.offsets + (numbers.astype(np.int64) << 47)) - 1
+    batch = headers[preceding]  # of the same number, as long as the description is not lost
+    with np.errstate(invalid="ignore"):  # a damaged log may contain signalling NaN
+        usable = (batch["mul"] > 0) & (batch["smp_rate"] > MIN_BATCH_RATE_HZ) & np.isfinite(batch["smp_rate"])
+    usable &= (preceding >= 0) & (batch["N"] == numbers)
+    found: dict[str, _Messages] = {}
+    for kind, (topic, _) in BATCH_TOPICS.items():
+        of_kind = usable & (batch["type"] == kind)
+        for number in np.unique(batch["instance"][of_kind]):
+            own = of_kind & (batch["instance"] == number)
+            name = f"{topic}:{number}" if number else topic
+            found[name] = _Messages(topic, samples.offsets[own], samples.layout, samples.factors, batch[own])
+    return found
 
 
 def _end_of_messages(log: Any) -> int:
@@ -195,14 +236,14 @@ def _factors(form: Any) -> dict[str, float]:
 
 def _select(path: Path, messages: Mapping[str, _Messages], topic: str | None, notes: list[str]) -> list[str]:
     """Return the names of the topics to read."""
-    topics = [
-        RecordedTopic(name, one.name, tuple(_known_fields(one)), one.offsets.size) for name, one in messages.items()
-    ]
+    topics = [RecordedTopic(name, one.name, tuple(_known_fields(one)), one.rows) for name, one in messages.items()]
     return select_topics(path, topics, _list_imus(messages), topic, EXPECTED, notes)
 
 
 def _known_fields(messages: _Messages) -> dict[str, str]:
     """Return the name of the field that contains each column."""
+    if messages.batches is not None:
+        return dict(zip(dict(BATCH_TOPICS.values())[messages.name], "xyz", strict=True))
     names = messages.layout.names or ()
     return {column: field for column, fields in FIELDS.items() for field in fields if field in names}
 
@@ -210,8 +251,9 @@ def _known_fields(messages: _Messages) -> dict[str, str]:
 def _list_imus(messages: Mapping[str, _Messages]) -> Sequence[Sequence[str]]:
     """Return the IMUs of a log. A gyroscope and an accelerometer with the same number form an IMU."""
     imus, gyros, accels = ([name for name in messages if name.startswith(kind)] for kind in ("IMU", "GYR", "ACC"))
-    pairs = [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if gyro[3:] == accel[3:]]
-    return [group for group in (imus, *([pairs] if pairs else [gyros, accels])) if group]
+    pairs = pair_triads(gyros, accels, lambda name: name[3:])
+    batches = [[name for name, one in messages.items() if one.name == topic] for topic, _ in BATCH_TOPICS.values()]
+    return [group for group in (imus, *([pairs] if pairs else [gyros, accels]), *batches) if group]
 
 
 # --- messages ------------------------------------------------------------------------------------
@@ -228,6 +270,8 @@ def _iter_blocks(log: Any, messages: _Messages) -> Iterator[np.ndarray[Any, np.d
 
 def _read_columns(log: Any, messages: _Messages) -> dict[str, Times]:
     """Return the columns of a topic in SI units, with the times in ns."""
+    if messages.batches is not None:
+        return _read_batches(log, messages, messages.batches)
     time = next((name for name in TIMES if name in (messages.layout.names or ())), None)
     if time is None:
         raise ValueError(f"{messages.name} has no time")
@@ -241,3 +285,18 @@ def _read_columns(log: Any, messages: _Messages) -> dict[str, Times]:
                 else:
                     columns[column].append(block[field].astype(np.float64) * messages.factors.get(field, 1.0))
     return {name: cast(Times, np.concatenate(parts)) for name, parts in columns.items()}
+
+
+def _read_batches(log: Any, messages: _Messages, batches: np.ndarray[Any, np.dtype[np.void]]) -> dict[str, Times]:
+    """Return the columns of a triad. ``batches`` [n] are the messages ISBH of all messages ISBD."""
+    start_ns = table.integers_to_ns(batches["SampleUS"], TIMES["SampleUS"])
+    blocks = list(_iter_blocks(log, messages))
+    position = BATCH_SIZE * np.concatenate([block["seqno"] for block in blocks]).astype(np.int64)
+    position = position[:, None] + np.arange(BATCH_SIZE)
+    used = position < batches["smp_cnt"][:, None]
+    ages_ns = np.rint(position * (1e9 / batches["smp_rate"].astype(np.float64))[:, None]).astype(np.int64)
+    columns: dict[str, Times] = {table.TIME_NS: (start_ns[:, None] + ages_ns)[used]}
+    for column, field in _known_fields(messages).items():
+        counts = np.concatenate([block[field] for block in blocks]).view("<i2").reshape(-1, BATCH_SIZE)
+        columns[column] = (counts / batches["mul"].astype(np.float64)[:, None])[used]
+    return columns

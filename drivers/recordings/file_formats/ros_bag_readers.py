@@ -8,6 +8,7 @@ This module imports rosbags, so only ``ros_bag_format`` imports this module, and
 """
 
 import os
+import re
 import struct
 import sys
 from bz2 import BZ2Decompressor
@@ -16,16 +17,19 @@ from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final, cast
 
 import apsw
 from lz4.frame import LZ4FrameDecompressor
 from rosbags import rosbag1, rosbag2
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat, Nodetype
 from rosbags.rosbag1.reader import Chunk, IndexData, decompressors
+from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag2.storage_mcap import McapReader, read_string
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+from rosbags.typesys import get_types_from_idl, get_types_from_msg
+from rosbags.typesys.msg import normalize_msgtype
 
 from drivers.errors import RecordingError
 from drivers.host.safe_file_reading import open_regular_file
@@ -58,11 +62,14 @@ INDEX_SIZE_OFFSET: Final = 51
 MCAP_FOOTER: Final = struct.Struct("<BQQQI8s")  # mcap.dev/spec: opcode, length, summary, summary offsets, CRC, magic
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 MCAP_RECORD: Final = struct.Struct("<BQ")  # opcode, length
-ROS1_PROFILE: Final = b"ros1"
+ROS2_NAMES: Final = {"ros1": "ros2", "ros1msg": "ros2msg"}
+"""Name of the profile and of the schema encoding of ROS 2, for those of ROS 1 (mcap.dev/spec/registry)."""
 MCAP_SCHEMA: Final = 0x03
 MCAP_CHUNK_INDEX: Final = 0x08
 MCAP_CHUNK_HEADER_BYTES: Final = 9 + 40
 """Bytes of a chunk record that precede the name of the compression and the messages."""
+IDL_HEADER: Final = re.compile(r"={80}\nIDL: .*\n")
+"""Lines before each definition of a schema with several definitions."""
 
 
 def iter_unpacked(file: IO[bytes], compression: str) -> Iterator[bytes]:
@@ -161,12 +168,22 @@ class Ros1Reader(rosbag1.Reader):
             raise RecordingError(f"{self.path}: the index of a chunk has {size} bytes, expected {MAX_INDEX_BYTES}")
 
 
+def _read_string(bio: Any) -> str:
+    """Return the text in a record of an MCAP file, with the names of ROS 2 in place of those of ROS 1.
+
+    The records of both are equal, but rosbags refuses those of ROS 1. The encoding of their messages is ``ros2``.
+    """
+    text = read_string(bio)
+    return ROS2_NAMES.get(text, text)
+
+
 class BoundedMcapReader(McapReader):
     """Reader of an MCAP file that refuses files without an index and large chunks."""
 
     def open(self) -> None:
         """Open the file."""
         check_mcap_index(Path(str(self.path)))
+        vars(storage_mcap)["read_string"] = _read_string
         super().open()
 
     def messages(
@@ -202,12 +219,6 @@ def check_mcap_index(path: Path) -> None:
         file.seek(0)
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             return  # rosbags describes the error
-        head = file.read(MCAP_RECORD.size + 4 + len(ROS1_PROFILE))
-        if head.endswith(ROS1_PROFILE):
-            raise RecordingError(
-                f"{path}: contains messages of ROS 1 in MCAP, expected messages of ROS 2; read the bag (.bag) from "
-                "which the file was made, or export the topic of the IMU to CSV"
-            )
         file.seek(max(end - MCAP_FOOTER.size, 0))
         footer = file.read()
         if len(footer) < MCAP_FOOTER.size or not footer.endswith(MCAP_MAGIC):
@@ -271,8 +282,46 @@ class BoundedFolderReader(DirectoryReader):
 
 
 class Ros2Reader(rosbag2.Reader):
-    """Reader of a ROS 2 bag."""
+    """Reader of a ROS 2 bag, or of an MCAP file with messages of ROS 1."""
 
     STORAGE_PLUGINS: Mapping[str, Any] = {
         "dir": BoundedFolderReader, ".mcap": BoundedMcapReader, ".db3": BoundedSqlite3Reader
     }  # fmt: skip
+
+    @property
+    def connections(self) -> list[Connection]:
+        """Connections with the names of types of ROS 2."""
+        return [one._replace(msgtype=normalize_msgtype(one.msgtype)) for one in super().connections]
+
+    @property
+    def is_cdr(self) -> bool:
+        """False for messages of ROS 1."""
+        formats = [cast(ConnectionExtRosbag2, one.ext).serialization_format for one in self.connections]
+        return ROS2_NAMES["ros1"] not in formats
+
+
+def list_fixed_fields(connection: Connection) -> tuple[tuple[str, str, int], ...]:
+    """Return the name, the type and the number of elements of each field of a message, or nothing if undefined.
+
+    Raises
+    ------
+    ValueError
+        If a field has no fixed size.
+    """
+    definition = connection.msgdef
+    if definition.format == MessageDefinitionFormat.NONE or not definition.data:
+        return ()
+    if definition.format == MessageDefinitionFormat.MSG:
+        types = get_types_from_msg(definition.data, connection.msgtype)
+    else:
+        types = {}
+        for idl in filter(None, IDL_HEADER.split(definition.data)):
+            types |= get_types_from_idl(idl)
+    fields = []
+    for name, described in types[connection.msgtype][1]:
+        node, description = cast(tuple[Nodetype, Any], described)
+        (element, base), count = description if node == Nodetype.ARRAY else ((node, description), 0)
+        if element != Nodetype.BASE or base[0] == "string":
+            raise ValueError(f"the field {name} of {connection.msgtype} has no fixed size")
+        fields.append((name, str(base[0]), int(count)))
+    return tuple(fields)

@@ -1,8 +1,9 @@
-"""Decoding and encoding of many ROS messages of type ``sensor_msgs/Imu`` or ``sensor_msgs/Temperature`` at once.
+"""Decoding and encoding of many ROS messages at once.
 
-Both types begin with a header: the time stamp, and the text ``frame_id`` with its length. All other fields are float64
-at fixed offsets after the text. Consecutive messages of a topic usually contain the same text, so their bytes can be
-read as a structured array.
+The types ``sensor_msgs/Imu`` and ``sensor_msgs/Temperature`` begin with a header: the time stamp, and the text
+``frame_id`` with its length. All other fields are float64 at fixed offsets after the text. Consecutive messages of a
+topic usually contain the same text, so their bytes can be read as a structured array. Other types can be decoded if
+each of their fields has a fixed size, as in ``px4_msgs``.
 
 ROS 2 messages are XCDR1 (OMG DDSI-RTPS 10.5): 4 bytes of encapsulation, whose second byte is 1 for little-endian, then
 fields that are aligned from byte 4. ROS 1 messages are little-endian without alignment and begin with a sequence
@@ -27,6 +28,9 @@ ACCEL_COVARIANCE: Final = 28
 NOT_PROVIDED: Final = -1.0
 """First covariance of a quantity that a message does not provide (sensor_msgs/Imu.msg)."""
 SECOND_NS: Final = 1_000_000_000
+CDR_HEADER_BYTES: Final = 4
+MAX_PADDING_BYTES: Final = 7
+"""Maximum number of bytes after the last field of a message."""
 TEXT_OFFSET: Final = 16
 """Offset of the text ``frame_id``, whose length precedes it."""
 BLOCK_BYTES: Final = 1 << 20
@@ -88,6 +92,47 @@ def decode_messages(block: Sequence[bytes], message_type: str, cdr: bool) -> tup
     values[numbers[:, GYRO_COVARIANCE] == NOT_PROVIDED, :3] = np.nan
     values[numbers[:, ACCEL_COVARIANCE] == NOT_PROVIDED, 3:] = np.nan
     return stamps_ns, values
+
+
+def decode_fixed_messages(block: Sequence[bytes], fields: Sequence[tuple[str, str, int]]) -> np.ndarray[Any, Any]:
+    """Decode ROS 2 messages of equal size whose fields have a fixed size.
+
+    Parameters
+    ----------
+    block
+        Bytes of each message.
+    fields
+        Name, NumPy type and number of elements of each field. The number is 0 for a field that is no array.
+
+    Returns
+    -------
+    numpy.ndarray
+        [n] structured array.
+
+    Raises
+    ------
+    ValueError
+        If the size of the messages does not fit the fields.
+    """
+    offsets, end = [], CDR_HEADER_BYTES
+    for _, kind, count in fields:
+        size = np.dtype(kind).itemsize
+        offsets.append(end + (CDR_HEADER_BYTES - end) % size)
+        end = offsets[-1] + size * max(count, 1)
+    if not end <= len(block[0]) <= end + MAX_PADDING_BYTES:
+        raise ValueError(f"a message has {len(block[0])} bytes, expected {end} according to the definition in the bag")
+    layout = np.dtype(
+        {
+            "names": [name for name, *_ in fields],
+            "formats": [(f"<{np.dtype(kind).str[1:]}", (count,) if count else ()) for _, kind, count in fields],
+            "offsets": offsets,
+            "itemsize": len(block[0]),
+        }
+    )
+    data = np.frombuffer(b"".join(block), np.uint8).reshape(len(block), -1)
+    rows, big_endian = data.view(layout)[:, 0].copy(), data[:, 1] == 0
+    rows[big_endian] = data[big_endian].view(layout.newbyteorder(">"))[:, 0]
+    return rows
 
 
 def encode_messages(template: bytes, message_type: str, stamps: Ints, values: Floats) -> list[bytes]:

@@ -511,6 +511,40 @@ BO_ 2 Accel: 8 X
 """
 
 
+DATABASE_IN_SI = """VERSION ""
+
+BU_: X
+
+BO_ 1 Imu: 12 X
+ SG_ Gx : 0|16@1- (0.001,0) [0|0] "rad/s" X
+ SG_ Gy : 16|16@1- (0.001,0) [0|0] "rad/s" X
+ SG_ Gz : 32|16@1- (0.001,0) [0|0] "rad/s" X
+ SG_ Ax : 48|16@1- (0.001,0) [0|0] "m/s^2" X
+ SG_ Ay : 64|16@1- (0.001,0) [0|0] "m/s^2" X
+ SG_ Az : 80|16@1- (0.001,0) [0|0] "m/s^2" X
+"""
+
+
+def test_frames_that_contradict_the_unit_in_the_database_are_rejected(tmp_path: Path) -> None:
+    """The database says m/s² or g, and the sensor sends m/s²."""
+    path = tmp_path / "imu.dbc"
+    path.write_text(DATABASE_IN_SI)
+    signals: dict[str, Any] = {axis: f"Imu.{axis.title()}" for axis in AXES}
+    counts = np.rint(np.random.default_rng(1).normal(size=(1250, 6)) * 20.0 + [9, 0, 0, 0, 0, 9810]).astype("<i2")
+    frames = [make_chunk(1, row.tobytes(), 20_000_000 * i) for i, row in enumerate(counts)]
+    right = build(path, signals)
+    assert sum(len(block) for frame in frames for block in right.feed([frame])) == 1250
+    assert right.recent_problem == ""
+    signals |= {axis: {"signal": signals[axis], "unit": "g"} for axis in AXES[3:]}
+    wrong = build(path, signals)
+    assert sum(len(block) for frame in frames for block in wrong.feed([frame])) < 1100
+    assert wrong.recent_problem == (
+        "the accelerometer measures 96.19 m/s² instead of gravity (9.81 m/s²): "
+        'set unit = "m/s²" for ax ay az in `signals`'
+    )
+    assert wrong.bad > 150
+
+
 def test_frames_with_equal_counters_form_a_sample(tmp_path: Path) -> None:
     path = tmp_path / "counted.dbc"
     path.write_text(DATABASE_WITH_COUNTERS)

@@ -19,8 +19,8 @@ correct checksum is kept, and ``first_line = "keep"`` keeps every first line. ``
 first line of a block, so that only an empty line is skipped.
 
 If the column ``t`` advances by a power of 1000 faster or slower than the arrival times, ``time_unit`` is wrong. All
-lines are then rejected, because the rate and the noise coefficients would be wrong. All lines are also rejected if
-``gyro_unit`` or ``accel_unit`` is not given, and motion and gravity in two windows show that the default is impossible.
+lines are then rejected, because the rate and the noise coefficients would be wrong. All lines are also rejected if they
+contradict the units or come from several sensors (``drivers.live_stream_check``).
 """
 
 import re
@@ -41,6 +41,7 @@ from drivers.decoders.text_lines.text.settings import (
     compute_factors_and_offsets,
 )
 from drivers.errors import ConfigError
+from drivers.live_stream_check import StreamConfiguration
 
 LABEL: Final = re.compile(rb"([^:]*[A-Za-z][^:]*):(.*)", re.DOTALL)
 """Regular expression that matches the label and the number of a field."""
@@ -56,13 +57,6 @@ TIME_UNITS: Final = ("s", "ms", "us", "ns")
 MIN_CLOCK_CHECK_S: Final = 0.5
 MIN_CLOCK_CHECK_LINES: Final = 20
 """Duration and number of lines after which the column ``t`` is compared with the arrival times."""
-MIN_UNIT_CHECK_S: Final = 10.0
-MIN_UNIT_CHECK_LINES: Final = 128
-"""Duration and number of lines of a window in which the units are examined."""
-MAX_UNIT_CHECK_LINES: Final = 50_000
-"""Number of lines that limits the memory of a window."""
-MAX_UNIT_CHECKS: Final = 60
-"""Number of windows after which default units are no longer examined."""
 UNWRAPPED_TICKS: Final = 1 << 62
 """Modulus in ticks for a device clock that does not wrap. The modulus corresponds to 146 years."""
 
@@ -73,7 +67,7 @@ class TextDecoder(base.RejectingDecoder):
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__()
+        super().__init__(_describe_configuration(settings))
         self._settings = settings
         self._pattern = compile_pattern(settings.pattern) if settings.pattern else None
         self._names = settings.columns if self._pattern is None else tuple(self._pattern.groupindex)
@@ -84,10 +78,6 @@ class TextDecoder(base.RejectingDecoder):
         self.timing: Timing = _timing(settings, self._names)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        scaled = {axis[0] for axis in settings.scale}
-        self._stated_units = [  # whether the unit of the gyroscopes and of the accelerometers is stated
-            f"{triad}_unit" in settings.model_fields_set or triad[0] in scaled for triad in ("gyro", "accel")
-        ]
         self.forget_stream_state()
 
     def forget_stream_state(self) -> None:
@@ -100,10 +90,6 @@ class TextDecoder(base.RejectingDecoder):
         self._clock_start: tuple[float, int] | None = None  # first count and arrival time
         self._clock_lines = 0  # number of lines with a count
         self._clock_problem = ""
-        self._unit_window: list[tuple[Ints, Floats]] = []  # arrival times and samples in which the units are examined
-        self._unit_lines = 0  # number of lines in this window
-        self._unit_checks = 0  # number of windows examined
-        self._suspected = self._unit_problem = ""  # result of the last window, and of two windows
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples in all lines that are complete after the given chunks."""
@@ -258,13 +244,7 @@ class TextDecoder(base.RejectingDecoder):
                 bad[:] = True
                 self._rejection.note_rejection(self._clock_problem)
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
-        judged = all(self._stated_units) or self._unit_checks >= MAX_UNIT_CHECKS or self._unit_problem
-        if not (judged or bad.all()):
-            self._check_units(t_ns[~bad], values[~bad])
         values[bad] = np.inf
-        if self._unit_problem:
-            values[:] = np.inf
-            self._rejection.note_rejection(self._unit_problem)
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
 
     def _check_time_unit(self, counts: Floats, t_ns: Ints) -> None:
@@ -285,25 +265,6 @@ class TextDecoder(base.RejectingDecoder):
                     f"column t advances {device_s / host_s:.3g} times as fast as the clock of this computer: set "
                     f'time_unit = "{unit}" ({rate_hz:.4g} Hz)'
                 )
-
-    def _check_units(self, t_ns: Ints, values: Floats) -> None:
-        """Set ``_unit_problem`` if two consecutive windows show that a unit that is not given is impossible."""
-        self._unit_window.append((t_ns, values))
-        self._unit_lines += len(t_ns)
-        lines, duration_s = self._unit_lines, int(t_ns[-1] - self._unit_window[0][0][0]) * 1e-9
-        if lines < MAX_UNIT_CHECK_LINES and (duration_s < MIN_UNIT_CHECK_S or lines < MIN_UNIT_CHECK_LINES):
-            return
-        window = np.concatenate([one for _, one in self._unit_window])
-        self._unit_window, self._unit_lines = [], 0
-        self._unit_checks += 1
-        problem = ""
-        if duration_s >= MIN_UNIT_CHECK_S:  # a capture that is replayed at once has no usable arrival times
-            # Most configurations state their units and need none of these modules.
-            from drivers.recordings.unit_check import describe_impossible_default_units
-
-            problem = describe_impossible_default_units(window, lines / duration_s, *self._stated_units)
-        self._unit_problem = problem if problem and self._suspected else ""
-        self._suspected = problem
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Encode each sample as one line with the configured columns and units, in full precision.
@@ -353,6 +314,18 @@ def _nmea_body(line: bytes) -> bytes | None:
         return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == base.xor_checksum(body) else None
     except ValueError:
         return None
+
+
+def _describe_configuration(settings: Settings) -> StreamConfiguration:
+    """Return what the settings state about the samples. A unit is also stated by a scale of its axes."""
+    scaled = {"gyro_unit" if axis.startswith("g") else "accel_unit" for axis in settings.scale if axis in AXES}
+    given = settings.model_fields_set | scaled
+    return StreamConfiguration(
+        (settings.gyro_unit, settings.accel_unit),
+        ("gyro_unit" in given, "accel_unit" in given),
+        lambda found: f"set {found.triad}_unit = {found.fits}",
+        "connect one sensor, or select its lines with `pattern`",
+    )
 
 
 def _timing(settings: Settings, columns: Sequence[str]) -> Timing:

@@ -77,3 +77,21 @@ def test_noise_raises_no_error(noise: list[bytes]) -> None:
     decoder = samples.build(samples.Settings())
     assert decoder.feed([Chunk(data, 0) for data in noise]) == []
     assert decoder.bad == len(noise)
+
+
+def test_messages_in_other_units_or_of_two_sensors_are_rejected() -> None:
+    values = np.random.default_rng(1).normal(size=(1300, 6)) * 0.01 + [0.01, 0.0, 0.0, 0.0, 0.0, 9.81]
+    mixed = np.where(np.arange(1300)[:, np.newaxis] % 2, values, values * [1, 1, 1, 0.5, -1, -1] + [0, 0, 0, 3, 0, 0])
+    expected = {
+        "": values,
+        'measures 999.9 m/s² instead of gravity (9.81 m/s²): the sender has to convert "mg" to m/s²': values
+        * np.repeat([1.0, 1000 / 9.81], 3),
+        "the samples of 2 sensors alternate (ax = ": mixed,
+    }
+    for problem, sent in expected.items():
+        decoder = samples.build(samples.Settings())
+        for at in range(0, 1300, 10):
+            block = make_block((at + np.arange(10)) * 20_000_000, sent[at : at + 10])
+            decoded = decoder.feed([Chunk(encode_samples("d", at + 10, block), 0)])
+        assert problem in decoder.recent_problem
+        assert bool(decoded) == (not problem)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from drivers import units
 from drivers.data_types import (
     AXES,
     ArrivalTimedFormat,
@@ -431,14 +432,82 @@ def live_values(motion: str, seconds: float = 25.0, rate_hz: float = 50.0) -> Fl
         values[:, 3:] = values[:, 3:] @ np.diag([1, 1, 0]) + [1000.0, 0.0, 9.81]
     if motion == "upside down":
         values[:, 3:] *= -1.0
+    if motion == "braking vehicle":  # the direction of the specific force turns with the pitch, but 30 times as far
+        values[:, 3] += 3.0 * np.sin(2.0 * t)
+        values[:, 1] -= math.radians(1.2) * np.cos(2.0 * t)
+    if motion == "tilted rate table":  # one turn per 3 samples about a horizontal axis
+        values[:, 0] += math.tau * rate_hz / 3.0
+        values[:, 3:] = 9.81 * np.column_stack(
+            [0 * t, *(f(math.tau * np.arange(len(t)) / 3.0) for f in (np.sin, np.cos))]
+        )
+        values[:, 3:] += 0.01 * values[:, [1, 2, 1]]
+    if motion == "flipped by hand":
+        values[:, 3:] *= np.sign(np.sin(t))[:, np.newaxis]
+    if motion == "without gravity":  # of a sensor that subtracts gravity, with a large bias
+        values[:, 3:] = 0.005 * values[:, :3] + [0.6, 0.0, 0.8]
     return np.asarray(values)
 
 
-@pytest.mark.parametrize(
-    "motion", ["rest", "tilting", "upside down", "fast rotation about the vertical", "centrifuge at 100 g"]
-)
+POSSIBLE_MOTIONS = (
+    "rest", "tilting", "upside down", "fast rotation about the vertical", "centrifuge at 100 g", "braking vehicle",
+    "tilted rate table", "flipped by hand",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("motion", POSSIBLE_MOTIONS)
 def test_possible_motions_never_cause_doubt_about_units(motion: str) -> None:
     values = live_values(motion)
+    assert decode_live(values) == (len(values), "")
+
+
+@pytest.mark.parametrize("motion", [*POSSIBLE_MOTIONS, "without gravity"])
+@pytest.mark.parametrize(("gyro_unit", "accel_unit"), [("rad/s", "m/s²"), ("deg/s", "g"), ("deg/s/131", "g/16384")])
+def test_possible_motions_never_cause_doubt_about_stated_units(motion: str, gyro_unit: str, accel_unit: str) -> None:
+    values = live_values(motion) / np.repeat(
+        [units.angular_rate_factor(gyro_unit), units.acceleration_factor(accel_unit)], 3
+    )
+    values = np.rint(values) if gyro_unit == "deg/s/131" else values
+    assert decode_live(values, gyro_unit=gyro_unit, accel_unit=accel_unit) == (len(values), "")
+
+
+@pytest.mark.parametrize(
+    ("factors", "motion", "stated", "key"),
+    [
+        ((1.0, 1.0), "rest", ("rad/s", "g"), 'accel_unit = "m/s²"'),
+        ((1.0, 1.0), "rest", ("deg/s", "g"), 'accel_unit = "m/s²"'),
+        ((1.0, 1000 / 9.80665), "rest", ("rad/s", "g"), 'accel_unit = "mg"'),
+        ((1.0, 1 / 9.80665), "tilting", ("rad/s", "m/s²"), 'accel_unit = "g"'),
+        ((math.degrees(1), 1.0), "tilting", ("rad/s", "m/s²"), 'gyro_unit = "deg/s"'),
+        ((131 * math.degrees(1), 1.0), "rest", ("deg/s", "m/s²"), 'gyro_unit = "deg/s/131"'),
+        ((1.0, 16384 / 9.80665), "rest", ("rad/s", "g/8192"), 'accel_unit = "g/16384"'),
+    ],
+)
+def test_lines_are_rejected_if_a_stated_unit_is_impossible(
+    factors: tuple[float, float], motion: str, stated: tuple[str, str], key: str
+) -> None:
+    values = live_values(motion) * np.repeat(factors, 3)
+    for triad, factor in ((slice(3), factors[0]), (slice(3, 6), factors[1])):
+        values[:, triad] = np.rint(values[:, triad]) if factor > 105.0 else values[:, triad]
+    count, problem = decode_live(values, gyro_unit=stated[0], accel_unit=stated[1])
+    assert count < 1100
+    assert key in problem
+
+
+@pytest.mark.parametrize("order", [[0, 1], [0, 1, 2], [0, 1, 0, 1, 1, 0, 0, 1]])
+def test_lines_of_several_sensors_on_one_wire_are_rejected(order: list[int]) -> None:
+    sensors = [live_values("rest"), live_values("upside down"), live_values("rest")[:, [1, 2, 0, 5, 3, 4]]]
+    which = np.resize(order, 1250)
+    values = np.stack(sensors)[which, np.arange(1250)]
+    count, problem = decode_live(values)
+    assert count < 1100
+    assert f"the samples of {max(order) + 1} sensors alternate" in problem
+    assert "connect one sensor, or select its lines with `pattern`" in problem
+
+
+def test_a_coarse_resolution_is_not_taken_for_two_sensors() -> None:
+    values = live_values("rest")
+    values[:, :3] = np.rint(values[:, :3] * 200.0) / 200.0
+    values[:, 3:] = np.rint(values[:, 3:] * 10.0) / 10.0
     assert decode_live(values) == (len(values), "")
 
 
@@ -461,8 +530,6 @@ def test_lines_are_rejected_if_a_default_unit_is_impossible(
     count, problem = decode_live(values)
     assert count < 1100
     assert key in problem
-    # The user decides.
-    assert decode_live(values, gyro_unit="rad/s", accel_unit="m/s²") == (len(values), "")
 
 
 def test_aliased_rotation_causes_no_doubt() -> None:
