@@ -309,7 +309,7 @@ class TestSeparators:
         ("time,gyro_x_furlong\n0,1\n", {}, '"furlong" is not a unit of angular rate'),
         ("time,gyro_x,gyr_x\n0,1,2\n", {}, "2 columns fit gx: gyro_x, gyr_x; choose one, such as --columns gx=gyro_x"),
         ("time,stamp,gx\n0,1,2\n", {}, "2 columns fit t: time, stamp; choose one"),
-        ("time,omega_r\n0,1\n", {}, "name its columns, such as --columns gx=omega_r"),
+        ("time,omega_r\n0,1\n", {}, "x.csv --columns gx=omega_r"),
         ("1,2\n2,3\n", {"columns": "gx=q"}, "header line is missing: line 1 consists of numbers"),
         (
             "t,gx\n0 1\n",
