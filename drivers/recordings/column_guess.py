@@ -26,7 +26,8 @@ MAX_LENGTH_SPREAD: Final = 0.03
 MAX_GRAVITY_DISTANCE: Final = log(1.12)
 GRAVITIES: Final = (G0, 1.0, 1000.0, 1000.0 * G0, *(float(2**k) for k in range(8, 16)))
 """Gravity in m/s², g, mg, mm/s², and in counts of usual sensitivities."""
-MAX_LISTED_COLUMNS: Final = 60
+MAX_LISTED_COLUMNS: Final = 200
+MAX_NUMBER: Final = 1e30
 SHOWN_VALUES: Final = 3
 
 ReadColumn = Callable[[int], Sequence[Any] | NDArray[Any]]
@@ -37,6 +38,7 @@ def guess_columns(numbers: Floats) -> dict[str, int]:
     """Return the index of the column of each quantity that the numbers [rows, columns] may contain. NaN means text."""
     if len(numbers) < MIN_ROWS:
         return {}
+    numbers = np.where(np.abs(numbers) < MAX_NUMBER, numbers, np.nan)
     steps = np.diff(numbers, axis=0)
     typical = np.median(steps, axis=0)
     steady = (steps > 0.0).all(axis=0) & (np.quantile(steps, 0.9, axis=0) < 2.0 * typical)
@@ -85,29 +87,33 @@ def create_unknown_columns_error(
     example
         Column in the command if the numbers do not suggest any.
     """
-    columns = [read_column(i) for i in range(len(names))]
-    rows = min((len(column) for column in columns), default=0)
-    guess = guess_columns(np.column_stack([_to_numbers(column[:rows]) for column in columns]))
+    columns = [read_column(i) for i in range(min(len(names), MAX_LISTED_COLUMNS))]
+    rows = max((len(column) for column in columns), default=0)
+    numbers = [_to_numbers(column, rows) for column in columns]
+    guess = guess_columns(np.column_stack(numbers)) if numbers else {}
     guess = {quantity: i for quantity, i in guess.items() if quantity not in known}
     options = ",".join(f"{quantity}={i + 1}" for quantity, i in guess.items()) or shlex.quote(f"gx={example}")
-    rate = "" if "t" in (*guess, *known) else " --rate HZ"
+    rate = "" if "t" in (*guess, *known) or "fs" in names else " --rate HZ"
     quantities = {i: quantity for quantity, i in (*guess.items(), *known.items())}
     lines = [f"{'column':6}  {'guess':5}  {'name':24}  first values"]
-    for i in range(len(names)):
-        if i in quantities or i < MAX_LISTED_COLUMNS:
-            values = " ".join(_format_value(value) for value in columns[i][:SHOWN_VALUES])
-            lines.append(f"{i + 1:<6}  {quantities.get(i, ''):5}  {names[i][:24]:24}  {values}")
+    for i, column in enumerate(columns):
+        values = " ".join(_format_value(value) for value in column[:SHOWN_VALUES])
+        lines.append(f"{i + 1:<6}  {quantities.get(i, ''):5}  {names[i][:24]:24}  {values}")
+    if len(names) > len(columns):
+        lines.append(f"{len(names) - len(columns)} more columns")
     command = f"imu-monitor analyze {shlex.quote(str(path))} --columns {options}{rate}"
     return UnknownColumnsError(f"{text}, such as {command}", lines)
 
 
-def _to_numbers(column: Sequence[Any] | NDArray[Any]) -> Floats:
+def _to_numbers(column: Sequence[Any] | NDArray[Any], rows: int) -> Floats:
+    """Return a column as numbers. A shorter column and a column of text become NaN."""
     try:
-        return np.asarray(column, np.float64)
-    except ValueError:
-        return np.full(len(column), np.nan)
+        numbers = np.asarray(column, np.float64)
+    except (ValueError, TypeError):
+        return np.full(rows, np.nan)
+    return numbers if len(numbers) == rows else np.full(rows, np.nan)
 
 
 def _format_value(value: Any) -> str:
-    text = value if isinstance(value, str) else f"{value:.12g}"
+    text = f"{value:.12g}" if isinstance(value, (int, float, np.integer, np.floating)) else str(value)
     return text.strip()[:24]

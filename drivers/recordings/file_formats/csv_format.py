@@ -31,7 +31,7 @@ from drivers.data_types import AXES
 from drivers.errors import RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
-from drivers.recordings.column_guess import create_unknown_columns_error
+from drivers.recordings.column_guess import MAX_NUMBER, create_unknown_columns_error
 from drivers.recordings.column_names import names_counter, names_sensor_kind, suggests_time
 from drivers.recordings.file_formats import csv_header
 from drivers.recordings.file_formats.csv_header import (
@@ -261,7 +261,7 @@ def _find_steady_columns(
     found = []
     for i in unused:
         numbers = np.array([np.nan if (x := parse_number(row[i], header.separator)) is None else x for row in rows])
-        steps = np.diff(numbers)
+        steps = np.diff(np.where(np.abs(numbers) < MAX_NUMBER, numbers, np.nan))
         low, typical, high = np.quantile(steps, (0.0, 0.5, 0.9))
         if low > 0.0 and high < 2.0 * typical and typical != 1.0 and not names_counter(header.names[i]):
             fractional = bool(np.any(np.mod(numbers, 1.0)))

@@ -25,7 +25,7 @@ from typing import IO, Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import RecordingError
+from drivers.errors import ImuError, RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.column_guess import EXAMINED_ROWS
@@ -91,7 +91,11 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
 
                 def read_column(i: int) -> NDArray[Any]:
                     name, key = pairs[i]
-                    return _take_column(_read_array(path, archive, key), name, key)[:EXAMINED_ROWS]
+                    try:
+                        _check_columns(path, archive, [key])
+                        return _take_column(_read_array(path, archive, key), name, key)[:EXAMINED_ROWS]
+                    except ImuError:  # an array of another type or shape
+                        return np.empty(0)
 
                 layout = find_layout(path, list(keys), options, notes, read_column=read_column)
                 used = {quantity: pairs[i] for quantity, i in layout.columns.items()}
@@ -142,7 +146,7 @@ def _find_column_keys(path: Path, archive: zipfile.ZipFile) -> dict[str, str]:
     """Return the name of the array for each column. A matrix has several columns (``table.name_matrix_columns``)."""
     names = _array_names(archive)
     table.check_column_count(path, len(names))
-    keys = {}
+    keys: dict[str, str] = {}
     for key in names:
         shape: tuple[int, ...] = ()
         with suppress(RecordingError):  # an error is reported only if the array is used
