@@ -288,10 +288,13 @@ def _is_magnetic(unit: str, sensor: str) -> bool:
 
 
 def suggests_time(name: str) -> bool:
-    """Return True if one of the words of a column name is that of a time, or if the column has a unit of time."""
-    return (
-        not _TIME_WORDS.isdisjoint(_split_words(name)) or KIND_OF["t"].find_unit(split_unit(name)[1] or "") is not None
-    )
+    """Return True if a column may contain times: one of the words is that of a time, or the unit is one of time.
+
+    >>> suggests_time("Timpstemp"), suggests_time("Shimmer_8665_Timestamp_Unix_CAL"), suggests_time("yaw")
+    (True, True, False)
+    """
+    has_word = any(word in _TIME_WORDS or word.startswith("tim") for word in _split_words(name))
+    return has_word or KIND_OF["t"].find_unit(split_unit(name)[1] or "") is not None
 
 
 def names_counter(name: str) -> bool:

@@ -3,6 +3,7 @@
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,21 +106,30 @@ def refusal(path: Path, **options: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "counter"),
+    ("name", "numbers", "possible"),
     [
-        ("packet_counter", 2 * COUNTER),
-        ("k", COUNTER),
-        ("k", 10 * COUNTER),
-        ("k", COUNTER + (COUNTER > 7)),  # one row is lost
-        ("frame", 4000 * COUNTER),
+        ("packet_counter", 2 * COUNTER, False),
+        ("k", COUNTER, False),
+        ("k", COUNTER + (COUNTER > 7), False),  # one row is lost
+        ("k", 10 * COUNTER, True),
+        ("theta", 0.1 * COUNTER + 1e-3 * SENSOR.gyro[:, 0], True),  # angle of a rate table
     ],
 )
-def test_a_counter_is_no_time(tmp_path: Path, name: str, counter: npt.NDArray[np.int64]) -> None:
+def test_other_numbers_that_increase_are_no_times(
+    tmp_path: Path, name: str, numbers: npt.NDArray[Any], possible: bool
+) -> None:
     path = tmp_path / "x.csv"
-    path.write_text(table(f"{name},{AXIS_NAMES}", counter, SENSOR.gyro, SENSOR.accel))
+    path.write_text(table(f"{name},{AXIS_NAMES}", numbers, SENSOR.gyro, SENSOR.accel))
     message = refusal(path)
     assert "give it with --rate HZ" in message
-    assert ("if it contains the time, give --columns t=1" in message) == (name == "k" and counter[2] == 20)
+    assert ("if it contains the time, give --columns t=1" in message) == possible
+
+
+def test_labels_of_activities_name_no_sensors(tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv"
+    labels = ["acceleration" if i % 50 < 25 else "braking" for i in range(len(SENSOR.t))]
+    path.write_text(table("time,x,y,z,label", SENSOR.t, SENSOR.accel, labels))
+    assert "no axis among its columns" in refusal(path)
 
 
 def test_rows_of_sensors_without_column_names(tmp_path: Path) -> None:
@@ -187,6 +197,7 @@ def test_lines_before_the_header_state_units_and_the_rate(tmp_path: Path) -> Non
     path.write_text(table(AXIS_NAMES, SENSOR.deg, SENSOR.g, before=before))
     found = read(path, {})
     assert found.rate_hz == 100.0
+    assert "Lines before the header state a sample rate of 100 Hz." in found.notes
     np.testing.assert_allclose(found.values, np.hstack([SENSOR.gyro, SENSOR.accel]), atol=2e-5)
     path.write_text(table(AXIS_NAMES, SENSOR.deg, SENSOR.g, before="# acc_unit = furlong\n"))
     assert '"furlong" is not a unit of acceleration' in refusal(path, rate="100")

@@ -59,7 +59,6 @@ NOT_SAMPLES: Final = re.compile(rb"^[ \t]*(?:[#%].*)?\n", re.MULTILINE)
 CAN_BYTE: Final = re.compile(r"(?:d|b|data|byte)[ _]?\d+", re.IGNORECASE)
 """Pattern of the names of columns that contain the bytes of a CAN frame, as SavvyCAN writes them."""
 MIN_CAN_BYTES: Final = 4
-MAX_COUNTER_STEP: Final = 50.0
 MAX_DURATION_DIFFERENCE: Final = 0.02
 """Largest relative difference of the durations of two sensors in the same rows."""
 TIME_SEARCH_BYTES: Final = 1 << 16
@@ -217,6 +216,8 @@ def _find_csv_layout(source: CsvSource, header: CsvHeader, options: ReadingOptio
     if stated := {quantity: unit for quantity, unit in header.stated_units.items() if quantity in layout.columns}:
         layout.units.update({**stated, **layout.units})
         notes.append(f"Lines before the header state the units {', '.join(dict.fromkeys(stated.values()))}.")
+    if header.stated_rate_hz is not None and "t" not in layout.columns:
+        notes.append(f"Lines before the header state a sample rate of {header.stated_rate_hz:g} Hz.")
     return layout
 
 
@@ -251,9 +252,9 @@ def _first_rows(header: CsvHeader) -> list[list[str]]:
 def _find_steady_columns(
     header: CsvHeader, layout: TableLayout, rows: Sequence[Sequence[str]]
 ) -> list[tuple[int, bool]]:
-    """Return the columns that may contain times, and for each True if it contains no counter.
+    """Return the columns that may contain times, and for each True if its name or its text shows that it does.
 
-    Times increase in nearly equal steps. Small integer steps may be those of a counter. A column of text times follows.
+    Times increase in nearly equal steps, but so do counters and the angle of a rate table.
     """
     unused = [i for i in range(len(header.names)) if i not in layout.columns.values()]
     if len(rows) < MIN_TIME_ROWS:
@@ -264,9 +265,9 @@ def _find_steady_columns(
         steps = np.diff(np.where(np.abs(numbers) < MAX_NUMBER, numbers, np.nan))
         low, typical, high = np.quantile(steps, (0.0, 0.5, 0.9))
         if low > 0.0 and high < 2.0 * typical and typical != 1.0 and not names_counter(header.names[i]):
-            fractional = bool(np.any(np.mod(numbers, 1.0)))
-            found.append((i, fractional or typical > MAX_COUNTER_STEP or suggests_time(header.names[i])))
-    return found + [(i, True) for i in unused if all(is_text_time(row[i]) for row in rows)]
+            found.append((i, suggests_time(header.names[i])))
+    texts = [i for i in unused if all(is_text_time(row[i]) for row in rows) and len({row[i] for row in rows}) > 1]
+    return found + [(i, True) for i in texts]
 
 
 def _find_text_time(header: CsvHeader, layout: TableLayout) -> str:

@@ -89,7 +89,7 @@ def _find_kinds_in_column(lines: Sequence[str]) -> dict[str, _RowKind]:
     for column in range(len(header) if start is not None else 1):
         words = {row[column].strip(): None for row in rows}
         sensors = [word for word in words if names_sensor_kind(word)]
-        if len(sensors) > 1 or (start is not None and len(words) > 1 and sensors):
+        if len(words) > 1 and "g" in map(names_sensor_kind, sensors):
             names = separator.join(header)
             return {word: _RowKind(names, column, (word.encode(),), separator=separator) for word in sensors}
     return {}
