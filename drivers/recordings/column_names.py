@@ -126,11 +126,12 @@ SENSOR_NAMES: Final[Mapping[str, tuple[str, int]]] = {
         ),
         ("a", 1),
     ),
+    "body rate": ("g", 3),
     "alpha": ("a", 3),  # Kalibr; elsewhere an angular acceleration
     # On phones, these names mean the acceleration without gravity.
     **dict.fromkeys(
         (
-            "linear acceleration", "linear accelerometer", "lin acc", "linear accel", "user acceleration",
+            "linear acceleration", "linear accelerometer", "lin acc", "linacc", "linear accel", "user acceleration",
             "user accel", "user acc", "free acc",
         ),
         ("a", 2),
@@ -178,7 +179,7 @@ _DESCRIPTIONS: Final = frozenset(
     (
         "imu", "raw", "sensor", "data", "field", "cal", "calibrated", "uncal", "uncalibrated", "calib", "body",
         "frame", "axis", "value", "val", "meas", "measured", "measurement", "msg", "message", "fields", "si", "the",
-        "of", "component", "signal", "in",
+        "of", "component", "signal", "in", "out",
     )
 )  # fmt: skip
 """Words beside sensor and axis that change neither the quantity nor the unit."""
@@ -204,11 +205,21 @@ _CODE: Final = re.compile("0?x[0-9a-fA-F]+")
 """Number of a message field in brackets, as MicroStrain writes it."""
 _AFTER_COMMA: Final = re.compile(r"^(.*\w)\s*,\s*([^,]*/[^,]*|m?g)\s*$")
 AXIS_LETTERS: Final = ("x", "y", "z")
+BODY_AXES: Final = {"roll": "x", "pitch": "y", "yaw": "z"}
+_BODY_RATE: Final = re.compile(r"(roll|pitch|yaw)[ _.]?(?:rate|speed)", re.IGNORECASE)
 _G_FORCE: Final = re.compile(r"\bgF(?=[xyz]\b)")
 _INDEX: Final = re.compile(r"\[([012])\]")
 _WORDS: Final = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])|\d+|²")
 
 
+POSITIONS: Final = frozenset(
+    (
+        "left", "right", "front", "rear", "back", "top", "bottom", "upper", "lower", "wrist", "hand", "arm", "ankle",
+        "foot", "leg", "thigh", "shank", "waist", "hip", "pelvis", "chest", "head", "trunk", "base", "primary",
+        "secondary", "main",
+    )
+)  # fmt: skip
+"""Words after the axis that name one of several sensors."""
 SENSOR_COLUMNS: Final = frozenset(
     (
         "I", "id", "imu", "imu id", "sensor", "sensor id", "instance", "device", "device id", "dev", "node", "bus",
@@ -336,6 +347,7 @@ def _split_words(text: str) -> list[str]:
     """
     indexed = _INDEX.sub(lambda index: " " + "xyz"[int(index[1])], text.replace("°", " deg "))
     indexed = _G_FORCE.sub("gforce ", indexed)
+    indexed = _BODY_RATE.sub(lambda found: f" body rate {BODY_AXES[found[1].lower()]} ", indexed)
     return [word.lower() for word in _WORDS.findall(indexed)]
 
 
@@ -403,9 +415,11 @@ def _describe_axis(
     spellings = KIND_OF[quantity].spellings
     at = next((at for at in range(len(ending)) if _unit_key(" ".join(ending[at:])) in spellings), len(ending))
     unit = spellings.get(_unit_key(" ".join(ending[at:]))) if at < len(ending) else None
-    inner_unit = next((word for word in inner if word in spellings), None)
-    if unit is None and inner_unit is not None:  # accG X
-        unit, inner = spellings[inner_unit], [word for word in inner if word != inner_unit]
+    spans = [(a, b) for a in range(len(inner)) for b in range(len(inner), a, -1)]
+    inner_unit = next(((a, b) for a, b in spans if _unit_key(" ".join(inner[a:b])) in spellings), None)
+    if unit is None and inner_unit is not None:  # accG X, gyro_rad_s_x
+        first, end = inner_unit
+        unit, inner = spellings[_unit_key(" ".join(inner[first:end]))], [*inner[:first], *inner[end:]]
     unit = unit or STANDARD_UNITS.get(phrase)
     others = [word for word in ending[:at] if word not in _DESCRIPTIONS]
     if unit is None and phrase not in ASSUMED_UNITS:
@@ -413,12 +427,12 @@ def _describe_axis(
     others = [word for word in others if word not in UNSCALED]
     if unit is None and "raw" in ending:
         return None  # raw counts are other columns
-    unknown = [word for word in others if not word.isdigit()]
+    unknown = [word for word in others if not word.isdigit() and word not in POSITIONS]
     if unit is None and unknown:
         unit, rank = " ".join(unknown), rank + 4
     numbered = inner[0] if inner and inner[0] in ("imu", "sensor") else ""
     names = [word for word in inner if word not in _DESCRIPTIONS | UNSCALED] + [
-        word for word in others if word.isdigit()
+        word for word in others if word.isdigit() or word in POSITIONS
     ]
     sensor = "".join(names)
     return ColumnName(

@@ -169,6 +169,14 @@ class TestLayouts:
         ("Time since start in ms ", "t", "ms"),
         ("temp_c", "temperature", "°C"),
         ("Temperature (K)", "temperature", "K"),
+        ("gyro_deg_s_x", "gx", "deg/s"),
+        ("accel_m_s2_z", "az", "m/s²"),
+        ("X_GYRO_OUT", "gx", None),
+        ("RollRate (deg/s)", "gx", "deg/s"),
+        ("yaw_rate", "gz", None),
+        ("linacc_y", "ay", None),
+        ("GForceZ (g)", "az", "g"),
+        ("AsX(°/s)", "gx", "°/s"),
     ],
 )
 def test_column_names(name: str, quantity: str, unit: str | None) -> None:
@@ -177,8 +185,30 @@ def test_column_names(name: str, quantity: str, unit: str | None) -> None:
     assert (found.quantity, found.unit) == (quantity, unit)
 
 
+def test_position_names_the_sensor() -> None:
+    found = parse_column_name("gyro_x_left")
+    assert found is not None
+    assert (found.quantity, found.unit, found.sensor) == ("gx", None, "left")
+
+
 @pytest.mark.parametrize(
-    "name", ["mx", "T", "mag_x", "gx_raw", "x", "roll_deg", "q", "", "speed", "max", "gyro_x_std", "acc_bias_x"]
+    "name",
+    [
+        "mx",
+        "T",
+        "mag_x",
+        "roll_rate_setpoint",
+        "yaw_rate_bias",
+        "gx_raw",
+        "x",
+        "roll_deg",
+        "q",
+        "",
+        "speed",
+        "max",
+        "gyro_x_std",
+        "acc_bias_x",
+    ],
 )
 def test_other_column_names(name: str) -> None:
     assert parse_column_name(name) is None
