@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -238,3 +239,16 @@ def test_arrays_of_other_types_are_listed_without_values(tmp_path: Path) -> None
     with pytest.raises(UnknownColumnsError, match=r"--columns gx=4,gy=5,gz=6,ax=7,ay=8,az=9$"):
         read(path, {})
     assert read(path, {"columns": "gx=4,gy=5,gz=6,ax=7,ay=8,az=9"}).rate_hz == 100.0
+
+
+def test_a_line_without_end_does_not_fill_the_memory(tmp_path: Path) -> None:
+    layout = next(one for one in LAYOUTS if one.name == "FlySight 2")
+    path = layout.write(simulate_sensor(layout.rate_hz), tmp_path)
+    with path.open("a") as file:
+        file.write("$IMU," + "1" * 30_000_000)
+    tracemalloc.start()
+    found = read(path, {})
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found) == len(SENSOR.t)
+    assert peak < 10e6

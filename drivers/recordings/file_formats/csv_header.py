@@ -43,6 +43,8 @@ SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", BLANKS: "bl
 DECIMAL_COMMA_SEPARATORS: Final = (";", "\t")
 _NO_ROW: Final = re.compile("[#%]|sep=.?$", re.IGNORECASE)
 """Start of a comment, and the line that tells Excel the separator."""
+MAX_METADATA_CHARACTERS: Final = 200
+"""Length of the lines before the header that are searched for units and for the sample rate."""
 MIN_NUMBER_ROWS: Final = 10
 MIN_NUMBERS: Final = 4
 """Number of lines, and of numbers in each line, of a table without a header line."""
@@ -139,7 +141,7 @@ def find_header(
     if header is None:
         return _build_numbered(label, rows[first], options, text[rows[first].begin :], sensor)
     found = _build_header(path, label, header, rows[first:], text, len(lines))
-    before = lines[: header.number - 1]
+    before = [line for line in lines[: header.number - 1] if len(line.text) <= MAX_METADATA_CHARACTERS]
     rates = {float(rate[1]) for line in before if (rate := _RATE_LINE.search(line.text))}
     rate_hz = rates.pop() if len(rates) == 1 else None
     return replace(found, stated_units=_read_stated_units(before), stated_rate_hz=rate_hz)

@@ -13,6 +13,7 @@ The rows of each sensor are copied to a temporary file, which is then read like 
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from typing import IO, Final
 
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings.column_names import names_sensor_kind, parse_column_name
-from drivers.recordings.file_formats.csv_format import CsvSource
+from drivers.recordings.file_formats.csv_format import MAX_LINE_BYTES, CsvSource
 from drivers.recordings.file_formats.csv_header import find_separator, split_header
 
 SEARCH_BYTES: Final = 1 << 16
@@ -66,11 +67,12 @@ def _find_row_kinds(path: Path) -> dict[str, _RowKind]:
         if found := _COLUMNS_LINE.fullmatch(line.strip()):
             kinds.setdefault(found[1], _RowKind(found[2], 0, (found[1].encode(), b"$" + found[1].encode())))
     units = {found[1]: found[2] for line in lines if (found := _UNITS_LINE.fullmatch(line.strip()))}
-    first_words = [line.partition(",")[0].lstrip("$") for line in lines if not line.startswith(("#", "$COL", "$UNIT"))]
+    rows = (line for line in lines if not line.startswith(("#", "$COL", "$UNIT")))
+    first_words = Counter(line.partition(",")[0].lstrip("$") for line in rows)
     kinds = {
         name: _RowKind(f",{kind.header}", 0, kind.words, f",{units[name]}" if name in units else "")
         for name, kind in kinds.items()
-        if first_words.count(name) >= MIN_ROWS and _names_axes(name, kind.header.split(","))
+        if first_words[name] >= MIN_ROWS and _names_axes(name, kind.header.split(","))
     }
     return kinds or _find_kinds_in_column(lines)
 
@@ -103,10 +105,10 @@ def _names_axes(sensor: str, names: Sequence[str]) -> bool:
 
 @contextmanager
 def _open_rows(path: Path, kind: _RowKind) -> Iterator[IO[bytes]]:
-    """Open a temporary file with the columns names and the rows of one sensor."""
+    """Open a temporary file with the column names and the rows of one sensor."""
     with open_regular_file(path) as file, TemporaryFile() as rows:
         rows.write(f"{kind.header}\n{kind.units}\n".encode() if kind.units else f"{kind.header}\n".encode())
-        for line in file:
+        for line in iter(lambda: file.readline(MAX_LINE_BYTES), b""):
             fields = line.split(kind.separator.encode(), kind.column + 1)
             if len(fields) > kind.column + 1 and fields[kind.column].strip() in kind.words and line.endswith(b"\n"):
                 rows.write(line)
