@@ -8,13 +8,14 @@
         LinkEnded                    the replayed file has ended; not retried
       DecodeError(ValueError)        one frame is invalid; ``feed`` counts the frame and continues
       RecordingError(ValueError)     the file is not a recording, or the file is empty
+        UnknownColumnsError          the user has to name the columns of a table
       NotReady                       too few samples for a result
 
 Links convert the exceptions of vendor libraries to these classes and keep the original exception as the cause. Any
 other exception in a module without I/O is a bug.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -90,6 +91,22 @@ class DecodeError(ImuError, ValueError):
 
 class RecordingError(ImuError, ValueError):
     """A file cannot be read as a recording."""
+
+
+class UnknownColumnsError(RecordingError):
+    """The columns of a table are not recognized.
+
+    Parameters
+    ----------
+    text
+        Error text with a command that names the columns.
+    column_lines
+        Table of the columns with their first values, which the command line prints below the error text.
+    """
+
+    def __init__(self, text: str, column_lines: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.column_lines = tuple(make_printable_and_shorten(line.rstrip()) for line in column_lines)
 
 
 class NotReady(ImuError):

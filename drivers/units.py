@@ -3,8 +3,9 @@
 Each table maps a unit name to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
 offset. Unit names are case-sensitive. An unknown unit raises ``ConfigError``.
 
-A unit of angular rate or acceleration may be divided by a number, as in ``deg/s/131`` or ``g/16384``. Data sheets state
-this number as the sensitivity in LSB/(°/s) or LSB/g. ``rad s^-1`` is another spelling of ``rad/s``.
+A unit of angular rate, acceleration or time may be divided by a number, as in ``deg/s/131``, ``g/16384`` or
+``s/10000``. Data sheets state this number as the sensitivity in LSB/(°/s) or LSB/g. ``rad s^-1`` is another spelling
+of ``rad/s``.
 """
 
 import math
@@ -114,8 +115,12 @@ def temperature_factor_and_offset(unit: str) -> tuple[float, float]:
 
 
 def time_factor(unit: str) -> float:
-    """Return the factor that converts a unit of time to s. Raise ConfigError if the unit is unknown."""
-    return _look_up(TIME, unit, "time")
+    """Return the factor that converts a unit of time to s. Raise ConfigError if the unit is unknown.
+
+    >>> time_factor("ms"), time_factor("s/10000")
+    (0.001, 0.0001)
+    """
+    return _look_up_scaled(TIME, unit, "time")
 
 
 def _look_up_scaled(table: Mapping[str, float], unit: str, quantity: str) -> float:

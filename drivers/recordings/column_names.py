@@ -82,6 +82,7 @@ KINDS: Final = (
         },
     ),
 )  # fmt: skip
+GYRO, ACCELEROMETER, TEMPERATURE, TIME = KINDS
 KIND_OF: Final[Mapping[str, QuantityKind]] = {name: kind for kind in KINDS for name in kind.quantities}
 
 _SYNONYMS: Final = tuple(
@@ -111,38 +112,46 @@ SENSOR_NAMES: Final[Mapping[str, tuple[str, int]]] = {
     **dict.fromkeys(
         (
             "g", "w", "gyr", "gyro", "gyros", "gyroscope", "omega", "angular velocity", "angular rate", "angular speed",
-            "ang vel", "angvel", "ang rate", "rotation rate", "rot rate", "w rs s", "gyro adc",
-            "gyroscope uncalibrated",
+            "ang vel", "angvel", "ang rate", "rotation rate", "rot rate", "rate of rotation", "rotational velocity",
+            "turn rate", "rate of turn", "w rs s", "gyro adc", "gyro rotation", "gyroscope uncalibrated", "uncal gyro",
+            "as", "角速度",
         ),
         ("g", 1),
     ),
     **dict.fromkeys(
         (
             "a", "acc", "acce", "accel", "acceleration", "accelerometer", "specific force", "a rs s", "acc smooth",
-            "acc adc", "total acceleration", "accelerometer uncalibrated", "accelerometer acceleration",
+            "acc adc", "total acceleration", "accelerometer uncalibrated", "accelerometer acceleration", "uncal accel",
+            "g force", "gforce", "accl", "加速度",
         ),
         ("a", 1),
     ),
+    "body rate": ("g", 3),
+    "alpha": ("a", 3),  # Kalibr; elsewhere an angular acceleration
     # On phones, these names mean the acceleration without gravity.
     **dict.fromkeys(
         (
-            "linear acceleration", "linear accelerometer", "lin acc", "linear accel", "user acceleration",
-            "user accel", "free acc",
+            "linear acceleration", "linear accelerometer", "lin acc", "linacc", "linear accel", "user acceleration",
+            "user accel", "user acc", "free acc",
         ),
         ("a", 2),
     ),
 }  # fmt: skip
 """Letter and rank of each sensor. A lower rank is preferred."""
+SAMPLE_TIME_FINE: Final = "sample time fine"
+"""Column of Xsens. Its unit is 0.1 ms in files of MTi and MTw sensors, and 1 µs in files of Movella DOT sensors."""
 TIME_NAMES: Final[Mapping[str, tuple[int, str | None]]] = {
     "seconds elapsed": (1, "s"), "time since start": (1, None), "time since start in": (1, None),
-    "elapsed time": (1, None), "header stamp": (1, None), "timestamp": (2, None), "time stamp": (2, None),
-    "time": (2, None), "stamp": (2, None), "ts": (2, None), "unix time": (2, None), "t": (2, None), "millis": (3, "ms"),
-    "micros": (3, "us"),
+    "elapsed time": (1, None), "elapsed realtime": (1, None), "header stamp": (1, None), "timestamp": (2, None),
+    "time stamp": (2, None), "time": (2, None), "stamp": (2, None), "ts": (2, None), "unix time": (2, None),
+    "t": (2, None), "sensor timestamp": (2, None), "millis": (3, "ms"), "micros": (3, "us"),
+    SAMPLE_TIME_FINE: (3, None), "gps seconds": (3, "s"), "gps so w": (3, "s"), "cts": (3, "ms"), "i tow": (3, None),
+    "utc time": (5, None), "时间": (2, None),
 }  # fmt: skip
 """Rank and implied unit of each column name that contains times."""
 _TIME_WORDS: Final = frozenset(
     (
-        "time", "timestamp", "stamp", "t", "elapsed", "epoch", "clock", "tow", "datetime", "itow",
+        "time", "timestamp", "stamp", "t", "elapsed", "epoch", "clock", "tow", "datetime", "itow", "sow",
     )
 )  # fmt: skip
 _WORDS_BESIDE_TIME: Final = frozenset(
@@ -150,19 +159,27 @@ _WORDS_BESIDE_TIME: Final = frozenset(
         "sample", "samples", "sensor", "imu", "system", "sys", "device", "host", "unix", "epoch", "utc", "gps",
         "local", "since", "start", "boot", "stamp", "elapsed", "time", "recording", "rec", "log", "logger", "of",
         "in", "relative", "total", "arduino", "pc", "mcu", "ros", "header", "measurement", "abs", "absolute", "clock",
-        "run",
+        "run", "rtc", "date", "phone", "logging", "reboot", "gyro", "gyroscope", "accelerometer", "motion", "gnss",
+    )
+)  # fmt: skip
+_OTHER_CLOCKS: Final = ("gyro", "gyroscope", "accelerometer", "motion", "phone", "host", "pc", "logging")
+"""Words of times that are read only if there is no better column, the preferred word first."""
+_COUNTER_WORDS: Final = frozenset(
+    (
+        "count", "counter", "cnt", "index", "idx", "id", "frame", "packet", "seq", "sequence", "sample", "row",
+        "number", "no", "num", "loop", "iteration", "line", "record",
     )
 )  # fmt: skip
 TEMPERATURE_NAMES: Final = frozenset(
-    ("temperature", "temp", "chip temperature", "chip temp", "die temperature", "die temp")
+    ("temperature", "temp", "chip temperature", "chip temp", "die temperature", "die temp", "温度")
 )
 LEADING_WORDS: Final = frozenset(("imu", "field", "data", "sensor"))
 """Words that are ignored at the start of a column name."""
 _DESCRIPTIONS: Final = frozenset(
     (
         "imu", "raw", "sensor", "data", "field", "cal", "calibrated", "uncal", "uncalibrated", "calib", "body",
-        "frame", "axis", "value", "val", "meas", "measured", "measurement", "msg", "message", "fields", "si", "ln",
-        "wr", "the", "of", "component", "signal", "in",
+        "frame", "axis", "value", "val", "meas", "measured", "measurement", "msg", "message", "fields", "si", "the",
+        "of", "component", "signal", "in", "out",
     )
 )  # fmt: skip
 """Words beside sensor and axis that change neither the quantity nor the unit."""
@@ -177,7 +194,7 @@ _OTHER_QUANTITIES: Final = frozenset(
     )
 )  # fmt: skip
 """Words of columns that do not contain the samples of a sensor."""
-STANDARD_UNITS: Final = {"w rs s": "rad/s", "a rs s": "m/s²"}
+STANDARD_UNITS: Final = {"w rs s": "rad/s", "a rs s": "m/s²", "g force": "g", "gforce": "g"}
 """Units of columns whose format always has these units."""
 ASSUMED_UNITS: Final = {"gyro adc": "deg/s", "acc smooth": "g/2048"}
 """Units of columns that never state their unit."""
@@ -187,10 +204,22 @@ _BRACKETED: Final = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]*[^\W\d_°][^\[\]()]
 _CODE: Final = re.compile("0?x[0-9a-fA-F]+")
 """Number of a message field in brackets, as MicroStrain writes it."""
 _AFTER_COMMA: Final = re.compile(r"^(.*\w)\s*,\s*([^,]*/[^,]*|m?g)\s*$")
+AXIS_LETTERS: Final = ("x", "y", "z")
+BODY_AXES: Final = {"roll": "x", "pitch": "y", "yaw": "z"}
+_BODY_RATE: Final = re.compile(r"(roll|pitch|yaw)[ _.]?(?:rate|speed)", re.IGNORECASE)
+_G_FORCE: Final = re.compile(r"\bgF(?=[xyz]\b)")
 _INDEX: Final = re.compile(r"\[([012])\]")
 _WORDS: Final = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])|\d+|²")
 
 
+POSITIONS: Final = frozenset(
+    (
+        "left", "right", "front", "rear", "back", "top", "bottom", "upper", "lower", "wrist", "hand", "arm", "ankle",
+        "foot", "leg", "thigh", "shank", "waist", "hip", "pelvis", "chest", "head", "trunk", "base", "primary",
+        "secondary", "main",
+    )
+)  # fmt: skip
+"""Words after the axis that name one of several sensors."""
 SENSOR_COLUMNS: Final = frozenset(
     (
         "I", "id", "imu", "imu id", "sensor", "sensor id", "instance", "device", "device id", "dev", "node", "bus",
@@ -236,10 +265,52 @@ def parse_column_name(name: str, sensor: str = "") -> ColumnName | None:
     words = [] if stem.strip() == "T" else _split_words(stem)  # T is a time or a temperature
     while len(words) > 1 and (words[0] in LEADING_WORDS or words[0].isdigit()) and not _names_sensor(words):
         del words[0]
+    if unit is not None and len(words) == 1 and words[0] in AXIS_LETTERS and not _is_magnetic(unit, sensor):
+        sensor = next((kind.name for kind in KINDS if kind.find_unit(unit) is not None), sensor)
+        words = words if sensor != "time" else ["time"]
     found = _match_time_or_temperature(words) or _match_axis(words, sensor)
     if found is None or unit is None:
         return found
     return ColumnName(found.quantity, found.rank, unit, found.assumed, found.sensor)
+
+
+def counts_week_seconds(name: str) -> bool:
+    """Return True if a column with this name contains the time since the start of the GPS week."""
+    stem = split_unit(name)[0]
+    words = _split_words(stem)
+    return bool({"tow", "itow", "sow"} & {*words}) or " ".join(words) in ("gps seconds", "gps so w")
+
+
+def names_sample_time_fine(name: str) -> bool:
+    """Return True for the column SampleTimeFine of Xsens."""
+    return " ".join(_split_words(name)) == SAMPLE_TIME_FINE
+
+
+def names_sensor_kind(text: str) -> str:
+    """Return "g" for the name of a gyroscope such as ``raw_gyro``, "a" for an accelerometer, or an empty text."""
+    words = [word for word in _split_words(text) if not word.isdigit()]
+    phrases = [" ".join(words[a:b]) for a in range(len(words)) for b in range(len(words), a, -1)]
+    return next((SENSOR_NAMES[phrase][0] for phrase in phrases if len(phrase) > 2 and phrase in SENSOR_NAMES), "")
+
+
+def _is_magnetic(unit: str, sensor: str) -> bool:
+    """Return True for the gauss of a magnetometer, whose symbol G also means the acceleration of gravity."""
+    return unit == "G" or "mag" in sensor.lower()
+
+
+def suggests_time(name: str) -> bool:
+    """Return True if a column may contain times: one of the words is that of a time, or the unit is one of time.
+
+    >>> suggests_time("Timpstemp"), suggests_time("Shimmer_8665_Timestamp_Unix_CAL"), suggests_time("yaw")
+    (True, True, False)
+    """
+    has_word = any(word in _TIME_WORDS or word.startswith("tim") for word in _split_words(name))
+    return has_word or KIND_OF["t"].find_unit(split_unit(name)[1] or "") is not None
+
+
+def names_counter(name: str) -> bool:
+    """Return True if a column with this name counts rows, frames or packets."""
+    return not _COUNTER_WORDS.isdisjoint(_split_words(name))
 
 
 def names_sensor(name: str) -> bool:
@@ -275,6 +346,8 @@ def _split_words(text: str) -> list[str]:
     (['gyro', 'adc', 'x'], ['imu', 'angular', 'velocity', 'x'])
     """
     indexed = _INDEX.sub(lambda index: " " + "xyz"[int(index[1])], text.replace("°", " deg "))
+    indexed = _G_FORCE.sub("gforce ", indexed)
+    indexed = _BODY_RATE.sub(lambda found: f" body rate {BODY_AXES[found[1].lower()]} ", indexed)
     return [word.lower() for word in _WORDS.findall(indexed)]
 
 
@@ -291,7 +364,8 @@ def _match_time_or_temperature(words: Sequence[str]) -> ColumnName | None:
             rank, implied = TIME_NAMES[text]
             return ColumnName("t", rank, unit or implied)
         if any(word in _TIME_WORDS for word in words[:at]) and {*words[:at]} <= _TIME_WORDS | _WORDS_BESIDE_TIME:
-            return ColumnName("t", 4, unit)
+            others = [_OTHER_CLOCKS.index(word) for word in words[:at] if word in _OTHER_CLOCKS]
+            return ColumnName("t", 4 if not others else 5 + max(others), unit)
     return None
 
 
@@ -341,9 +415,11 @@ def _describe_axis(
     spellings = KIND_OF[quantity].spellings
     at = next((at for at in range(len(ending)) if _unit_key(" ".join(ending[at:])) in spellings), len(ending))
     unit = spellings.get(_unit_key(" ".join(ending[at:]))) if at < len(ending) else None
-    inner_unit = next((word for word in inner if word in spellings), None)
-    if unit is None and inner_unit is not None:  # accG X
-        unit, inner = spellings[inner_unit], [word for word in inner if word != inner_unit]
+    spans = [(a, b) for a in range(len(inner)) for b in range(len(inner), a, -1)]
+    inner_unit = next(((a, b) for a, b in spans if _unit_key(" ".join(inner[a:b])) in spellings), None)
+    if unit is None and inner_unit is not None:  # accG X, gyro_rad_s_x
+        first, end = inner_unit
+        unit, inner = spellings[_unit_key(" ".join(inner[first:end]))], [*inner[:first], *inner[end:]]
     unit = unit or STANDARD_UNITS.get(phrase)
     others = [word for word in ending[:at] if word not in _DESCRIPTIONS]
     if unit is None and phrase not in ASSUMED_UNITS:
@@ -351,12 +427,12 @@ def _describe_axis(
     others = [word for word in others if word not in UNSCALED]
     if unit is None and "raw" in ending:
         return None  # raw counts are other columns
-    unknown = [word for word in others if not word.isdigit()]
+    unknown = [word for word in others if not word.isdigit() and word not in POSITIONS]
     if unit is None and unknown:
         unit, rank = " ".join(unknown), rank + 4
     numbered = inner[0] if inner and inner[0] in ("imu", "sensor") else ""
     names = [word for word in inner if word not in _DESCRIPTIONS | UNSCALED] + [
-        word for word in others if word.isdigit()
+        word for word in others if word.isdigit() or word in POSITIONS
     ]
     sensor = "".join(names)
     return ColumnName(

@@ -19,6 +19,7 @@ from drivers.recordings.file_formats import (
 )
 from drivers.recordings.file_formats import parquet_and_arrow_format as arrow_format
 from drivers.recordings.file_formats.csv_header import is_table_text
+from drivers.recordings.file_formats.csv_row_kinds import contains_row_kinds
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table import OpenWriter, Table, describe_suffix_mismatch
 from drivers.recordings.table_layout import convert_to_si
@@ -100,8 +101,10 @@ def find_format(path: Path) -> Format:
     if csv_per_sensor_format.is_sensor_folder(path):
         return _SENSOR_FILES
     suffix = _suffix(path)
-    if not suffix and path.is_file() and is_table_text(path):
-        suffix = ".csv"
+    if suffix in ("", ".csv") and path.is_file():
+        if contains_row_kinds(path):
+            return _SENSOR_FILES
+        suffix = suffix or (".csv" if is_table_text(path) else "")
     if not suffix:
         raise ConfigError(
             f"{path}: the suffix is not that of a recording; known are {' '.join(FORMATS)}"

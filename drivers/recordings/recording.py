@@ -23,7 +23,7 @@ from drivers.data_types import (
 )
 from drivers.errors import ConfigError, RecordingError, make_printable_and_shorten
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
-from drivers.recordings.table import BATCH_ROWS, T_LIMIT_S, TIME_NS, Columns, Table, column_dtype
+from drivers.recordings.table import BATCH_ROWS, POSSIBLE_TIMES, T_LIMIT_S, TIME_NS, Columns, Table, column_dtype
 from drivers.recordings.table_layout import find_unit
 from drivers.recordings.unit_check import describe_likely_unit_errors
 from drivers.units import time_factor
@@ -141,7 +141,10 @@ def assemble_recording(path: Path, table: Table, rate_hz: float | None, options:
     if times is None and rate is None:
         why = next((f" ({note.rstrip('.')})" for note in notes if note.startswith("fs ")), "")
         fs = f"a usable fs{why}" if why else "fs"
-        raise ConfigError(f"{path}: has neither t nor {fs}, so its rate is not known; give it with --rate HZ")
+        times_note = next((f". {note.rstrip('.')}" for note in notes if note.startswith(POSSIBLE_TIMES)), "")
+        raise ConfigError(
+            f"{path}: has neither t nor {fs}, so its rate is not known; give it with --rate HZ{times_note}"
+        )
     axes = tuple(a for a in AXES if a in table.columns)
     values = _stack_axes(table.columns, n)[rows]
     stored_c = cast(Floats | None, table.columns.get("temperature"))
@@ -292,6 +295,13 @@ def take_last(found: Recording, last_s: float) -> Recording:
     return _read_only_recording(times, values, temperature_c, found.rate_hz, found.axes, (*found.notes, note))
 
 
+def _overlaps(one: Recording, other: Recording) -> bool:
+    """Return True if two recordings were made at the same time."""
+    if one.t_s is None or other.t_s is None:
+        return False
+    return bool(one.t_s[0] < other.t_s[-1] and other.t_s[0] < one.t_s[-1])
+
+
 def concatenate_recordings(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
     """Concatenate the recordings of the segments in a folder.
 
@@ -307,8 +317,17 @@ def concatenate_recordings(path: Path, parts: Sequence[Recording], notes: list[s
     Raises
     ------
     RecordingError
-        If only some of the recordings have times, or if they have no times and different sample rates.
+        If only some of the recordings have times, if they have no times and different sample rates, or if
+        recordings of different axes overlap.
     """
+    first = parts[0]
+    other = next((part for part in parts if not {*part.axes} & {*first.axes} and _overlaps(part, first)), None)
+    if other is not None:
+        measured = f"{' '.join(first.axes)} and {' '.join(other.axes)}"
+        raise RecordingError(
+            f"{path}: its files measure different axes ({measured}) and are no segments of one recording; name one "
+            "file after the gyroscope and one after the accelerometer, such as gyro.csv and accel.csv, to join them"
+        )
     times = [part.times for part in parts if part.times is not None]
     if len({one.dtype for one in times}) > 1:
         times = [times_to_seconds(one) for one in times]

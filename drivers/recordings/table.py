@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ NO_TIME_NS: Final = int(np.iinfo(np.int64).min)
 ALIASES: Final = {"temp": "temperature"}
 """Alternative column names, each mapped to the name in COLUMNS."""
 
+POSSIBLE_TIMES: Final = "A column increases steadily:"
+"""Start of the note about a column that contains times or a counter."""
+
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
 """Example of a header line, quoted in error messages."""
 
@@ -42,6 +45,8 @@ T_LIMIT_S: Final = 4.6e9
 
 PARTIAL_SUFFIX: Final = ".part"
 """Suffix that is added to a file name while the file is being written."""
+
+T = TypeVar("T", Floats, Ints, Times)
 
 Columns = Mapping[str, Times]
 """Mapping from names in COLUMNS to float64 arrays [n] of equal length, and from TIME_NS to an int64 array."""
@@ -104,6 +109,32 @@ def column_seconds(columns: Columns) -> Floats:
     return np.where(columns[TIME_NS] == NO_TIME_NS, np.nan, times_to_seconds(columns[TIME_NS]))
 
 
+def name_matrix_columns(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a matrix by name. The longer side of a matrix is the time.
+
+    The columns of an n×3 matrix ``gyro`` are named ``gyro_x``, ``gyro_y`` and ``gyro_z``, and those of any other matrix
+    ``data_1``, ``data_2`` and so on.
+    """
+    columns = array if array.shape[0] >= array.shape[1] else array.T
+    width = columns.shape[1]
+    if width == 1:
+        return {name: columns[:, 0]}
+    endings = "xyz" if width == 3 else map(str, range(1, width + 1))
+    return {f"{name}_{ending}": column for ending, column in zip(endings, columns.T, strict=True)}
+
+
+def unwrap_times(times: T, period: int) -> T:
+    """Return times that continue where they start again at 0 after a period, such as a day or a week.
+
+    The period has the unit of the times.
+    """
+    present = np.flatnonzero(np.isfinite(times) if times.dtype.kind == "f" else times != NO_TIME_NS)
+    steps = np.diff(times[present])
+    result = times.copy()
+    result[present[1:]] += period * np.cumsum((steps < -period // 2).astype(np.int64) - (steps > period // 2))
+    return result
+
+
 def check_column_count(path: Path, columns: int) -> None:
     """Raise RecordingError if a file has too many columns."""
     if columns > memory_check.MAX_COLUMNS:
@@ -136,8 +167,28 @@ CONTENTS: Final = (
 NO_RECORDINGS: Final = (
     (re.compile(rb"version https://git-lfs"), "a pointer of Git LFS: fetch the file with `git lfs pull`"),
     (re.compile(rb"\s*<(?:!doctype html|html)", re.IGNORECASE), "an HTML page: download the file itself"),
+    (re.compile(rb"PK\x03\x04.{26}\[Content_Types\]", re.DOTALL), "an Excel workbook: save the sheet as CSV"),
+    (re.compile(rb"\x93NUMPY"), "a single NumPy array: save it with numpy.savez in a file that ends in .npz"),
+    (re.compile(rb"\s*(?:\{|\[\s*[\[{])"), "JSON: convert it to CSV"),
+    (
+        re.compile(rb"\s*(?:\(\d+\.\d+\)\s+)?\w+\s+[0-9A-Fa-f]{3,8}(?:#|\s+\[\d+\]\s)"),
+        "CAN frames as candump prints them: rename it to end in .log, and give --decoder dbc --option file=NAME.dbc",
+    ),
 )
-"""Start and description of files that were fetched in place of a recording, with the remedy."""
+"""Start and description of files in place of a recording, with the remedy."""
+
+
+def describe_no_recording(path: Path) -> str:
+    """Return an error text about a file that contains no samples, with a remedy, or an empty text."""
+    return next((f"; its content is {what}" for pattern, what in NO_RECORDINGS if pattern.match(_read_start(path))), "")
+
+
+def _read_start(path: Path) -> bytes:
+    try:
+        with open_regular_file(path) as file:
+            return file.read(256)
+    except OSError:
+        return b""
 
 
 def describe_suffix_mismatch(path: Path) -> str:
@@ -145,14 +196,9 @@ def describe_suffix_mismatch(path: Path) -> str:
 
     The text states the detected type of file and a remedy. If the type is unknown, the text is empty.
     """
-    try:
-        with open_regular_file(path) as file:
-            start = file.read(256)
-    except OSError:
-        return ""
-    for pattern, what in NO_RECORDINGS:
-        if pattern.match(start):
-            return f"; its content is {what}"
+    if other := describe_no_recording(path):
+        return other
+    start = _read_start(path)
     for magic, what, suffixes in CONTENTS:
         if start.startswith(magic):
             if path.name.lower().endswith(suffixes or ("",)) and suffixes:

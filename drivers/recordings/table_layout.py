@@ -14,11 +14,13 @@ import numpy as np
 
 from drivers.data_types import AXES, NS_PER_S, Floats, Times
 from drivers.errors import ConfigError, RecordingError
+from drivers.recordings.column_guess import ReadColumn, create_unknown_columns_error
 from drivers.recordings.column_names import (
     KIND_OF,
     KINDS,
     UNSCALED,
     ColumnName,
+    counts_week_seconds,
     find_ending_unit,
     names_sensor,
     parse_column_name,
@@ -35,6 +37,7 @@ from drivers.recordings.table import (
     describe_suffix_mismatch,
     format_name_list,
     integers_to_ns,
+    unwrap_times,
 )
 from drivers.recordings.topic_selection import HOW_TO_CHOOSE
 from drivers.recordings.unit_inference import infer_units
@@ -51,6 +54,7 @@ MAX_LISTED_NAMES: Final = 60
 MAX_SENSORS: Final = 32
 """Number of different values up to which a column can tell the rows of several sensors apart."""
 
+WEEK_S: Final = 604_800
 MIN_INTERLEAVED_ROWS: Final = 240
 MIN_SEPARATION: Final = 5.0
 """Ratio of the difference of two means to the standard deviation from which alternating rows belong to two sensors."""
@@ -72,6 +76,7 @@ def find_layout(
     notes: list[str],
     where: str = "",
     sensor: str = "",
+    read_column: ReadColumn | None = None,
 ) -> TableLayout:
     """Find the column and the unit of each quantity.
 
@@ -89,6 +94,8 @@ def find_layout(
         Position of the column names in the file, used in error messages, such as " in line 3".
     sensor
         Name of the sensor for columns that are only named ``x``, ``y`` and ``z``.
+    read_column
+        Returns the first values of a column, which an error message shows.
 
     Raises
     ------
@@ -113,11 +120,17 @@ def find_layout(
             if free:
                 chosen[quantity] = _select_candidate(path, names, quantity, free)
     if not any(axis in chosen for axis in AXES):
-        raise RecordingError(
+        cut = next((note.rstrip(".") for note in notes if "cut off" in note), "")
+        if cut:
+            raise RecordingError(f"{path}: {cut}; no axis is left among its columns ({format_name_list(names)})")
+        what = (
             f"{path}: no axis among its columns ({format_name_list(names, MAX_LISTED_NAMES)}){where}; a recording "
-            f"has some of {' '.join(AXES)}; name its columns, such as --columns gx={_example_name(names)}"
-            f"{describe_suffix_mismatch(path)}"
+            f"has some of {' '.join(AXES)}; name its columns"
         )
+        mismatch = describe_suffix_mismatch(path)
+        if read_column is not None and not mismatch:
+            raise create_unknown_columns_error(path, names, what, read_column, chosen, _example_name(names))
+        raise RecordingError(f"{what}, such as --columns gx={_example_name(names)}{mismatch}")
     if sensor_column is not None:
         chosen[SENSOR] = sensor_column
     others = [name for i, name in enumerate(names) if i not in chosen.values() and name not in ("", "fs")]
@@ -154,6 +167,8 @@ def convert_to_si(path: Path, table: Table, options: ReadingOptions) -> Table:
             continue
         factor, offset = _find_conversion(path, quantity, find_unit(table, options, quantity))
         name, numbers = _convert(quantity, column, factor, offset)
+        if quantity == "t" and counts_week_seconds(table.names.get("t", "")):
+            numbers = unwrap_times(numbers, WEEK_S * (int(NS_PER_S) if name == TIME_NS else 1))
         columns[name] = numbers
     for kind in KINDS:
         given = getattr(options, kind.key)
@@ -173,11 +188,17 @@ def _select_named_sensor(
     ConfigError
         If the user must choose a sensor, or if the chosen sensor does not exist.
     """
-    axes = {i: one for i, one in meanings.items() if one.quantity in AXES and one.quantity not in options.columns}
+    axes = {
+        i: one
+        for i, one in _without_common_name(meanings).items()
+        if one.quantity in AXES and one.quantity not in options.columns
+    }
     sensors = sorted({one.sensor for one in axes.values()} - {""})
     topic = options.topic
     if topic in sensors:
-        return {i: one for i, one in meanings.items() if i not in axes or one.sensor == topic}
+        measured = {one.quantity for one in axes.values() if one.sensor == topic}
+        others = {i for i, one in axes.items() if one.sensor != topic and (one.sensor or one.quantity in measured)}
+        return {i: one for i, one in meanings.items() if i not in others}
     if topic is not None and not has_sensor_column:
         if sensors:
             raise ConfigError(f'{path}: has no sensor "{topic}"; it has {", ".join(sensors)}')
@@ -191,6 +212,19 @@ def _select_named_sensor(
             f"{path}: contains the columns of {len(sensors)} sensors: {listed}; {HOW_TO_CHOOSE}, such as {sensors[0]}"
         )
     return dict(meanings)
+
+
+def _without_common_name(meanings: Mapping[int, ColumnName]) -> dict[int, ColumnName]:
+    """Return the columns without the name of the device, which begins the names of all sensors."""
+    quantities: dict[str, set[str]] = {}
+    for one in meanings.values():
+        if one.quantity in AXES:
+            quantities.setdefault(one.sensor, set()).add(one.quantity)
+    common = min(quantities, key=len, default="")
+    own = quantities.pop(common, set())
+    if not all(sensor.startswith(common) for sensor in quantities) or own & set().union(*quantities.values()):
+        return dict(meanings)
+    return {i: replace(one, sensor=one.sensor.removeprefix(common)) for i, one in meanings.items()}
 
 
 def _select_rows_of_sensor(path: Path, table: Table, options: ReadingOptions) -> Table:
@@ -315,9 +349,9 @@ def is_known_column(name: str, options: ReadingOptions) -> bool:
     return name in options.columns.values() or parse_column_name(name) is not None
 
 
-def names_an_axis(names: Sequence[str]) -> bool:
+def names_an_axis(names: Sequence[str], sensor: str = "") -> bool:
     """Return True if one of the column names is the name of an axis."""
-    return any((meaning := parse_column_name(name)) is not None and meaning.quantity in AXES for name in names)
+    return any((meaning := parse_column_name(name, sensor)) is not None and meaning.quantity in AXES for name in names)
 
 
 def _find_given_column(path: Path, names: Sequence[str], quantity: str, column: str) -> int:
@@ -353,7 +387,10 @@ def _select_candidate(path: Path, names: Sequence[str], quantity: str, candidate
     if quantity == "t" and len(stated := [i for i in best if candidates[i].unit is not None]) == 1:
         best = stated
     if len({names[i] for i in best}) < len(best):
-        raise RecordingError(f"{path}: column {names[best[0]]} occurs twice; each may occur once")
+        raise RecordingError(
+            f"{path}: column {names[best[0]]} occurs twice; each may occur once: give its number, such as "
+            f"--columns {quantity}={best[0] + 1}"
+        )
     if len(best) > 1:
         listed = format_name_list([names[i] for i in best])
         raise RecordingError(
@@ -398,8 +435,9 @@ def _stated_units(
 def _convert(quantity: str, column: Times, factor: float, offset: float) -> tuple[str, Times]:
     """Return the name of the converted column, and its numbers."""
     if column.dtype.kind in "iu":
-        if factor < 1.0:
-            t_ns = integers_to_ns(column, round(factor * NS_PER_S))
+        ns_per_unit = round(factor * NS_PER_S)
+        if factor < 1.0 and abs(factor * NS_PER_S - ns_per_unit) < 1e-6:
+            t_ns = integers_to_ns(column, ns_per_unit)
             if 2 * np.count_nonzero(t_ns == NO_TIME_NS) <= t_ns.size:
                 return TIME_NS, t_ns
         column = np.where(column == NO_TIME_NS, np.nan, column.astype(np.float64))

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, Times
 from drivers.impossible_units import measure_rotation
-from drivers.recordings.column_names import KIND_OF, KINDS, UNSCALED
+from drivers.recordings.column_names import ACCELEROMETER as ACCEL
+from drivers.recordings.column_names import GYRO, KIND_OF, KINDS, TIME, UNSCALED, names_sample_time_fine
 from drivers.recordings.table import NO_TIME_NS, TIME_NS
 from drivers.units import DEGREE, G0, acceleration_factor, angular_rate_factor, time_factor
 
@@ -33,7 +34,6 @@ MIN_SAMPLES: Final = 100
 BLOCKS: Final = 16
 BLOCK_ROWS: Final = 1024
 """Number and length of the parts of a recording that are examined."""
-GYRO, ACCEL, TEMPERATURE, TIME = KINDS
 TIME_UNITS: Final = ("s", "ms", "us", "ns")
 ROW_NUMBER: Final = "row number"
 """Hypothesis that a column counts the rows instead of a time."""
@@ -251,6 +251,8 @@ def _list_candidates(
     if kind == TIME.name:
         if not evidence.step or (own and 1.0 < 1.0 / evidence.step < MAX_RATE_HZ):
             return {"s": 0.0}
+        if names_sample_time_fine(names["t"]):
+            return {"s/10000": 0.0, "us": 0.0}
         found = dict.fromkeys(TIME_UNITS, 0.0)
         own_s = OWN_TIME if parts[0].dtype.kind == "f" else 6.0
         found["s"] = own_s if own else 3.0 if fractional else 0.0

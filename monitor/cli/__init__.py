@@ -17,6 +17,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from drivers.errors import UnknownColumnsError
 from drivers.secret_masking import remember_secrets_of_process
 from monitor.cli import (
     analyze,
@@ -149,7 +150,7 @@ def main() -> None:
         if isinstance(error, OSError):
             _discard_output()
         if not isinstance(error, BrokenPipeError):  # nobody reads the output of a broken pipe
-            _fail(line, status)
+            _fail(line, status, error.column_lines if isinstance(error, UnknownColumnsError) else ())
     if status == INTERRUPTED:  # typer converts Ctrl-C to an Exit exception
         _fail("interrupted", INTERRUPTED)
     sys.exit(status)
@@ -196,8 +197,8 @@ def _discard_output() -> None:
         os.close(nowhere)
 
 
-def _fail(line: str, status: int) -> NoReturn:
+def _fail(line: str, status: int, details: Sequence[str] = ()) -> NoReturn:
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):  # if standard error fails, only the status remains
-            print(f"imu-monitor: {line}", file=sys.stderr, flush=True)  # noqa: T201
+            print("\n".join((f"imu-monitor: {line}", *details)), file=sys.stderr, flush=True)  # noqa: T201
     sys.exit(status)

@@ -20,9 +20,10 @@ from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingErr
 from drivers.links.replay_link import CARRIERS, ReplayLink, detect_file_kind
 from drivers.recordings import Recording, create_recording, load_samples, memory_check, take_last
 from drivers.recordings.file_formats.csv_header import is_table_text
+from drivers.recordings.file_formats.csv_row_kinds import contains_row_kinds
 from drivers.recordings.reading_options import DEFAULT_OPTIONS, ReadingOptions
 from drivers.recordings.reading_progress import listen_to_reading_progress
-from drivers.recordings.table import TIME_NS
+from drivers.recordings.table import TIME_NS, describe_no_recording
 from drivers.timing.arrival_timeline import split_by_arrival_time
 from drivers.timing.sample_clock import SampleClock
 from drivers.validation import module_lookup
@@ -92,6 +93,8 @@ def load_recording(
     if decoder is None:
         if kind in CONTENTS and not (kind in CARRIERS and _is_table(path)):
             names = list_decoders(CARRIERS[kind]) if kind in CARRIERS else module_lookup.list_modules(drivers.decoders)
+            if kind == "capture" and (other := describe_no_recording(path)):
+                raise RecordingError(f"{path}: contains no samples{other}")
             raise ConfigError(f"{path}: contains {CONTENTS[kind]}; name the decoder with --decoder: {', '.join(names)}")
         report_progress("reading", None)
         with listen_to_reading_progress(lambda share: report_progress("reading", share)):
@@ -109,7 +112,7 @@ def load_recording(
 def _is_table(path: Path) -> bool:
     """Return True if a file with the suffix of a capture or of a CAN log contains a table."""
     try:
-        return is_table_text(path)
+        return is_table_text(path) or contains_row_kinds(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {describe_error(error)}") from error
 

@@ -169,6 +169,14 @@ class TestLayouts:
         ("Time since start in ms ", "t", "ms"),
         ("temp_c", "temperature", "°C"),
         ("Temperature (K)", "temperature", "K"),
+        ("gyro_deg_s_x", "gx", "deg/s"),
+        ("accel_m_s2_z", "az", "m/s²"),
+        ("X_GYRO_OUT", "gx", None),
+        ("RollRate (deg/s)", "gx", "deg/s"),
+        ("yaw_rate", "gz", None),
+        ("linacc_y", "ay", None),
+        ("GForceZ (g)", "az", "g"),
+        ("AsX(°/s)", "gx", "°/s"),
     ],
 )
 def test_column_names(name: str, quantity: str, unit: str | None) -> None:
@@ -177,8 +185,30 @@ def test_column_names(name: str, quantity: str, unit: str | None) -> None:
     assert (found.quantity, found.unit) == (quantity, unit)
 
 
+def test_position_names_the_sensor() -> None:
+    found = parse_column_name("gyro_x_left")
+    assert found is not None
+    assert (found.quantity, found.unit, found.sensor) == ("gx", None, "left")
+
+
 @pytest.mark.parametrize(
-    "name", ["mx", "T", "mag_x", "gx_raw", "x", "roll_deg", "q", "", "speed", "max", "gyro_x_std", "acc_bias_x"]
+    "name",
+    [
+        "mx",
+        "T",
+        "mag_x",
+        "roll_rate_setpoint",
+        "yaw_rate_bias",
+        "gx_raw",
+        "x",
+        "roll_deg",
+        "q",
+        "",
+        "speed",
+        "max",
+        "gyro_x_std",
+        "acc_bias_x",
+    ],
 )
 def test_other_column_names(name: str) -> None:
     assert parse_column_name(name) is None
@@ -309,7 +339,7 @@ class TestSeparators:
         ("time,gyro_x_furlong\n0,1\n", {}, '"furlong" is not a unit of angular rate'),
         ("time,gyro_x,gyr_x\n0,1,2\n", {}, "2 columns fit gx: gyro_x, gyr_x; choose one, such as --columns gx=gyro_x"),
         ("time,stamp,gx\n0,1,2\n", {}, "2 columns fit t: time, stamp; choose one"),
-        ("time,omega_r\n0,1\n", {}, "name its columns, such as --columns gx=omega_r"),
+        ("time,omega_r\n0,1\n", {}, "x.csv --columns gx=omega_r"),
         ("1,2\n2,3\n", {"columns": "gx=q"}, "header line is missing: line 1 consists of numbers"),
         (
             "t,gx\n0 1\n",

@@ -1,7 +1,8 @@
 """Write the generated parts of the reference pages: ``python -m tests.experiments.reference_pages``.
 
 A generated part stands between the comments ``<!-- generated: NAME -->`` and ``<!-- end -->``. The commands come from
-the command line, the configuration keys from the settings models, and the messages from the message classes.
+the command line, the configuration keys from the settings models, the messages from the message classes, and the
+layouts from the list that the tests use.
 """
 
 import ast
@@ -25,6 +26,7 @@ from monitor.publishing.messages import results
 from monitor.publishing.messages.message import Message
 from monitor.settings import driver_settings
 from monitor.settings.printed_defaults import FIRST_LINK, describe_keys, format_toml_value, list_tables
+from tests.drivers.public_layouts import LAYOUTS
 
 PAGES: Final = sorted((Path(__file__).resolve().parents[2] / "docs" / "reference").glob("*.md"))
 PART: Final = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -211,9 +213,20 @@ def format_python() -> str:
     return "\n".join(["```{eval-rst}", *parts, "```"])
 
 
+def format_layouts() -> str:
+    """List the layouts of public programs and data sets that the tests read."""
+    rows = []
+    for layout in LAYOUTS:
+        names = " and ".join(f"`{word}`" for word in layout.options.split() if word.startswith("--"))
+        result = "refused as such" if layout.refused else f"asks for {names}" if names else "read"
+        rows.append(f"| {layout.name} | {_cell(layout.peculiarity)} | {result} | {_cell(layout.source)} |")
+    return _table(("layout", "peculiarity", "result", "source"), rows)
+
+
 PARTS: Final[dict[str, Callable[[], str]]] = {
     "commands": format_commands,
     "configuration": format_configuration,
+    "layouts": format_layouts,
     "messages": format_messages,
     "python": format_python,
 }

@@ -27,9 +27,12 @@ from typing import IO, Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import AXES
 from drivers.errors import RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.column_guess import MAX_NUMBER, create_unknown_columns_error
+from drivers.recordings.column_names import names_counter, names_sensor_kind, suggests_time
 from drivers.recordings.file_formats import csv_header
 from drivers.recordings.file_formats.csv_header import (
     BLANKS,
@@ -39,10 +42,11 @@ from drivers.recordings.file_formats.csv_header import (
     parse_number,
     split_fields,
 )
-from drivers.recordings.file_formats.text_times import has_date, is_text_time, parse_text_time, unwrap_days
+from drivers.recordings.file_formats.text_times import DAY_NS, has_date, is_text_time, parse_text_time
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.reading_progress import report_read_share
-from drivers.recordings.table_layout import TableLayout, find_layout
+from drivers.recordings.table import POSSIBLE_TIMES
+from drivers.recordings.table_layout import TableLayout, find_layout, names_an_axis
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
@@ -52,6 +56,14 @@ MAX_BAD_LINES: Final = 100_000
 """Number of invalid lines after which reading stops if most lines are invalid."""
 NOT_SAMPLES: Final = re.compile(rb"^[ \t]*(?:[#%].*)?\n", re.MULTILINE)
 """Pattern of blank lines and comment lines."""
+CAN_BYTE: Final = re.compile(r"(?:d|b|data|byte)[ _]?\d+", re.IGNORECASE)
+"""Pattern of the names of columns that contain the bytes of a CAN frame, as SavvyCAN writes them."""
+MIN_CAN_BYTES: Final = 4
+MAX_DURATION_DIFFERENCE: Final = 0.02
+"""Largest relative difference of the durations of two sensors in the same rows."""
+TIME_SEARCH_BYTES: Final = 1 << 16
+MIN_TIME_ROWS: Final = 20
+"""Size of the text, and number of rows, in which a column of times without a usual name is searched."""
 GZIP_BYTES: Final = 1 << 16
 """Number of compressed bytes that are decompressed at once.
 
@@ -127,15 +139,11 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
     label = Path(source.label)
     with source.open_stream() as file:
         texts = _whole_lines(_decompressed(file, notes), notes)
-        header = csv_header.find_header(source.path, label, texts, options)
+        header = csv_header.find_header(source.path, label, texts, options, source.sensor)
         if header is None:
             what = notes[-1] if notes else "It has no line at all."
             raise RecordingError(f"{label}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
-        layout = find_layout(
-            label, header.names, options, notes, f" in line {header.number}" if header.number else "", source.sensor
-        )
-        if header.has_units:
-            notes.append("The line after the header states the units.")
+        layout = _find_csv_layout(source, header, options, notes)
         text_time = _find_text_time(header, layout)
         converters: _Converters = {}
         if text_time:
@@ -163,8 +171,103 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
     columns = {name: rows[name] for name in layout.columns}
     if text_time and not has_date(text_time):
-        columns["t"] = unwrap_days(columns["t"])
-    return table.Table(columns, None, notes, layout.units, layout.names, tuple(sensors))
+        columns["t"] = table.unwrap_times(columns["t"], DAY_NS)
+    rate_hz = None if "t" in columns else header.stated_rate_hz
+    return table.Table(columns, rate_hz, notes, layout.units, layout.names, tuple(sensors))
+
+
+def _find_csv_layout(source: CsvSource, header: CsvHeader, options: ReadingOptions, notes: list[str]) -> TableLayout:
+    """Find the columns, and the units that names, a row of units or lines before the header state."""
+    label = Path(source.label)
+    where = f" in line {header.number}" if header.number else ""
+    rows = _first_rows(header)
+
+    def read_column(i: int) -> Sequence[Any]:
+        numbers = [parse_number(row[i], header.separator) for row in rows]
+        return [row[i] if number is None else number for row, number in zip(rows, numbers, strict=True)]
+
+    if not header.number and not options.columns and not names_an_axis(header.names, source.sensor):
+        what = f"{label}: {csv_header.describe_missing_header(header.rest_number)}"
+        raise create_unknown_columns_error(label, header.names, what, read_column)
+    if sum(CAN_BYTE.fullmatch(name) is not None for name in header.names) >= MIN_CAN_BYTES and not options.columns:
+        raise RecordingError(
+            f"{label}: contains CAN frames and no samples; save them as a candump log (in SavvyCAN: Can-Dump), and read"
+            " the log with --decoder dbc --option file=NAME.dbc"
+        )
+    found: list[str] = []
+    layout = find_layout(label, header.names, options, found, where, source.sensor, read_column)
+    steady = [] if "t" in (*layout.columns, *options.columns) else _find_steady_columns(header, layout, rows)
+    certain = [i for i, is_certain in steady if is_certain]
+    if certain:
+        chosen = options.model_copy(update={"columns": {**options.columns, "t": str(certain[0] + 1)}})
+        found = [
+            f"Column {header.names[certain[0]]} increases steadily and is read as the time; to leave it out, give "
+            "--columns t=- --rate HZ."
+        ]
+        layout = find_layout(label, header.names, chosen, found, where, source.sensor)
+    elif steady:
+        i = steady[0][0]
+        found.append(f"{POSSIBLE_TIMES} {header.names[i]}; if it contains the time, give --columns t={i + 1}.")
+    else:
+        _check_times_of_sensors(label, header, layout, rows)
+    notes += found
+    if header.has_units:
+        notes.append("The line after the header states the units.")
+    if stated := {quantity: unit for quantity, unit in header.stated_units.items() if quantity in layout.columns}:
+        layout.units.update({**stated, **layout.units})
+        notes.append(f"Lines before the header state the units {', '.join(dict.fromkeys(stated.values()))}.")
+    if header.stated_rate_hz is not None and "t" not in layout.columns:
+        notes.append(f"Lines before the header state a sample rate of {header.stated_rate_hz:g} Hz.")
+    return layout
+
+
+def _check_times_of_sensors(label: Path, header: CsvHeader, layout: TableLayout, rows: Sequence[Sequence[str]]) -> None:
+    """Raise RecordingError if the two sensors have times of their own that advance at different rates."""
+    times = {
+        kind: i
+        for i, name in enumerate(header.names)
+        if suggests_time(name) and (kind := names_sensor_kind(name)) and all(row[i] for row in rows)
+    }
+    durations = {}
+    for kind, i in times.items():
+        numbers = [parse_number(row[i], header.separator) for row in rows]
+        first, last = (numbers[0], numbers[-1]) if len(rows) > 1 else (None, None)
+        durations[kind] = None if first is None or last is None else last - first
+    gyro_s, accel_s = durations.get("g"), durations.get("a")
+    both = {quantity[0] for quantity in layout.columns if quantity in AXES} == {"g", "a"}
+    if both and gyro_s and accel_s and abs(gyro_s - accel_s) > MAX_DURATION_DIFFERENCE * gyro_s:
+        raise RecordingError(
+            f"{label}: the times of the gyroscope and of the accelerometer advance at different rates; read one of "
+            f"them, such as --columns t={times['g'] + 1},ax=-,ay=-,az=- or "
+            f"--columns t={times['a'] + 1},gx=-,gy=-,gz=-"
+        )
+
+
+def _first_rows(header: CsvHeader) -> list[list[str]]:
+    """Return the fields of the first rows that have as many fields as the header."""
+    lines = header.rest[:TIME_SEARCH_BYTES].decode("utf-8", errors="replace").splitlines()[:-1]
+    return [fields for line in lines if len(fields := split_fields(line, header.separator)) == len(header.names)]
+
+
+def _find_steady_columns(
+    header: CsvHeader, layout: TableLayout, rows: Sequence[Sequence[str]]
+) -> list[tuple[int, bool]]:
+    """Return the columns that may contain times, and for each True if its name or its text shows that it does.
+
+    Times increase in nearly equal steps, but so do counters and the angle of a rate table.
+    """
+    unused = [i for i in range(len(header.names)) if i not in layout.columns.values()]
+    if len(rows) < MIN_TIME_ROWS:
+        return []
+    found = []
+    for i in unused:
+        numbers = np.array([np.nan if (x := parse_number(row[i], header.separator)) is None else x for row in rows])
+        steps = np.diff(np.where(np.abs(numbers) < MAX_NUMBER, numbers, np.nan))
+        low, typical, high = np.quantile(steps, (0.0, 0.5, 0.9))
+        if low > 0.0 and high < 2.0 * typical and typical != 1.0 and not names_counter(header.names[i]):
+            found.append((i, suggests_time(header.names[i])))
+    texts = [i for i in unused if all(is_text_time(row[i]) for row in rows) and len({row[i] for row in rows}) > 1]
+    return found + [(i, True) for i in texts]
 
 
 def _find_text_time(header: CsvHeader, layout: TableLayout) -> str:
@@ -192,7 +295,7 @@ def read_csv_column_names(source: CsvSource, options: ReadingOptions) -> list[st
     """Return the column names of a CSV file, without reading the samples. Return no names if there is no header."""
     with source.open_stream() as file:
         texts = _whole_lines(_decompressed(file, []), [])
-        header = csv_header.find_header(source.path, Path(source.label), texts, options)
+        header = csv_header.find_header(source.path, Path(source.label), texts, options, source.sensor)
         return header.names if header is not None else []
 
 

@@ -11,8 +11,8 @@ A row of units may follow the header. Its units are appended to the column names
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Final
@@ -20,7 +20,8 @@ from typing import Final
 from drivers.errors import RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import table
-from drivers.recordings.column_names import KINDS, split_unit
+from drivers.recordings.column_names import ACCELEROMETER, GYRO, KINDS, TIME, names_sensor_kind, split_unit
+from drivers.recordings.file_formats.text_times import is_text_time
 from drivers.recordings.reading_options import NOT_READ, ReadingOptions
 from drivers.recordings.table_layout import names_an_axis
 
@@ -28,9 +29,11 @@ MAX_PREAMBLE_BYTES: Final = 1 << 20
 """Maximum total size of the blank lines and comments before the header."""
 COMMENT_MARKS: Final = ("#", "%")
 MAX_TABLE_START_BYTES: Final = 1 << 16
+SENSOR_FIELDS: Final = ("time", "x", "y", "z")
+"""Columns of a file without a header line that is named after a sensor, as RIDI and ADVIO write them."""
 MAX_PREAMBLE_LINES: Final = 500
 """Number of lines that are searched for column names of an axis."""
-NO_UNITS: Final = ("", "-", "--", "n/a", "none", "None", "1", "bool", "count", "counts", "#")
+NO_UNITS: Final = ("", "-", "--", "n/a", "none", "None", "1", "bool", "count", "counts", "#", "unix time", "utc")
 """Fields in a row of units for columns without a unit."""
 BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 BLANKS: Final = ""
@@ -40,6 +43,23 @@ SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", BLANKS: "bl
 DECIMAL_COMMA_SEPARATORS: Final = (";", "\t")
 _NO_ROW: Final = re.compile("[#%]|sep=.?$", re.IGNORECASE)
 """Start of a comment, and the line that tells Excel the separator."""
+MAX_METADATA_CHARACTERS: Final = 200
+"""Length of the lines before the header that are searched for units and for the sample rate."""
+MIN_NUMBER_ROWS: Final = 10
+MIN_NUMBERS: Final = 4
+"""Number of lines, and of numbers in each line, of a table without a header line."""
+_RATE_LINE: Final = re.compile(
+    r"(?:sampl(?:e|ing)|update|data|output)[ _]?(?:rate|frequency)\W*(\d+(?:\.\d*)?) ?Hz", re.IGNORECASE
+)
+_SCALE_LINE: Final = re.compile(r"[\W_]*([tga]scale)\s*[,;:=\s]\s*([-+.\deE]+)[\s,;]*", re.IGNORECASE)
+_SCALED_UNITS: Final = {"tscale": (TIME, "s"), "gscale": (GYRO, "rad/s"), "ascale": (ACCELEROMETER, "g")}
+"""Units of the scales of Gyroflow files."""
+_UNIT_LINE: Final = re.compile(
+    r"[\W_]*(gyro|gyroscope|acc|accel|accelerometer|time|timestamp|temperature)[ _]units?\s*[,;:=]\s*(.*?)[\s,;]*",
+    re.IGNORECASE,
+)
+_ENCLOSED: Final = re.compile(r"\s*[\[(]\s*(.*?)\s*[\])]\s*")
+"""Unit in brackets."""
 _QUOTED: Final = re.compile('"[^"]*"')
 
 
@@ -54,6 +74,8 @@ class CsvHeader:
     rest_number: int  # line number of the first line of ``rest``
     sample: str | None  # first line of samples
     has_units: bool = False  # True if a row of units follows the header
+    stated_rate_hz: float | None = None  # sample rate that a line before it states
+    stated_units: Mapping[str, str] = field(default_factory=dict)  # unit of each quantity that a line before it states
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +86,9 @@ class _Line:
     end: int  # offset of the next line
 
 
-def find_header(path: Path, label: Path, texts: Iterator[bytes], options: ReadingOptions) -> CsvHeader | None:
+def find_header(
+    path: Path, label: Path, texts: Iterator[bytes], options: ReadingOptions, sensor: str = ""
+) -> CsvHeader | None:
     """Find the header of a CSV file. Return None if the text contains no complete line.
 
     Parameters
@@ -77,6 +101,8 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
         Pieces of text that end at line ends. The function reads the pieces up to the first line of samples.
     options
         Columns that the user names.
+    sensor
+        Name of the sensor of a file with the samples of one sensor.
 
     Raises
     ------
@@ -107,12 +133,33 @@ def find_header(path: Path, label: Path, texts: Iterator[bytes], options: Readin
             )
         return _build_header(path, label, comments[-1], [], text, len(lines))
     first, header = _find_header_row(rows)
-    before = [line for line in comments if header is None and line.number < rows[first].number]
-    if before and _is_header_comment(before[-1].text, rows[first].text):
-        header = before[-1]
+    if header is None or not names_an_axis(split_header(header.text)):
+        start = first if header is None else 0
+        before = [line for line in comments if line.number < rows[start].number]
+        if before and _is_header_comment(before[-1].text, rows[start].text):
+            first, header = start, before[-1]
     if header is None:
-        return _build_numbered(label, rows[first], options, text[rows[first].begin :])
-    return _build_header(path, label, header, rows[first:], text, len(lines))
+        return _build_numbered(label, rows[first], options, text[rows[first].begin :], sensor)
+    found = _build_header(path, label, header, rows[first:], text, len(lines))
+    before = [line for line in lines[: header.number - 1] if len(line.text) <= MAX_METADATA_CHARACTERS]
+    rates = {float(rate[1]) for line in before if (rate := _RATE_LINE.search(line.text))}
+    rate_hz = rates.pop() if len(rates) == 1 else None
+    return replace(found, stated_units=_read_stated_units(before), stated_rate_hz=rate_hz)
+
+
+def _read_stated_units(lines: Sequence[_Line]) -> dict[str, str]:
+    """Return the unit of each quantity that lines before the header state, such as ``gscale,0.001`` of Gyroflow."""
+    units: dict[str, str] = {}
+    for line in lines[:MAX_PREAMBLE_LINES]:
+        if scale := _SCALE_LINE.fullmatch(line.text):
+            number = parse_number(scale[2], ",") or 0.0
+            if number > 0.0:
+                kind, unit = _SCALED_UNITS[scale[1].lower()]
+                units |= dict.fromkeys(kind.quantities, f"{unit}/{1.0 / number:.12g}")
+        elif stated := _UNIT_LINE.fullmatch(line.text):
+            kind = next(kind for kind in KINDS if kind.name[:2] == stated[1][:2].lower())
+            units |= dict.fromkeys(kind.quantities, kind.find_unit(stated[2]) or stated[2])
+    return units
 
 
 def _find_header_row(rows: Sequence[_Line]) -> tuple[int, _Line | None]:
@@ -120,7 +167,7 @@ def _find_header_row(rows: Sequence[_Line]) -> tuple[int, _Line | None]:
     for i, row in enumerate(rows[:MAX_PREAMBLE_LINES]):
         if names_an_axis(split_header(row.text)):
             return i + 1, row
-        fields = split_fields(row.text, _first_separator(row.text))
+        fields = split_fields(row.text, find_separator(row.text))
         if len(fields) > 1 and _consists_of_numbers(row.text):
             alike = i and len(split_header(rows[i - 1].text)) == len(fields)
             return i, rows[i - 1] if alike or i == 1 else None
@@ -128,16 +175,22 @@ def _find_header_row(rows: Sequence[_Line]) -> tuple[int, _Line | None]:
 
 
 def is_table_text(path: Path) -> bool:
-    """Return True if a text file contains a line of column names with an axis, and numbers in the next line."""
+    """Return True if a text file contains a line of column names with an axis, or only lines of numbers."""
     with open_regular_file(path) as file:
         lines = list(_iter_lines(file.read(MAX_TABLE_START_BYTES), 0))
     rows = [line.text for line in lines if line.text.strip()]
     for row, following in pairwise(rows[:MAX_PREAMBLE_LINES]):
         names = split_header(row)
         if len(names) > 1 and names_an_axis(names):
-            fields = [field.strip() for field in split_fields(following, _first_separator(following))]
+            fields = [field.strip() for field in split_fields(following, find_separator(following))]
             return _is_unit_row(fields, len(names)) or any(parse_number(field, ",") is not None for field in fields)
-    return False
+    rows = [row for row in rows if not _NO_ROW.match(row)]
+    widths = {len(split_fields(row, find_separator(row))) for row in rows}
+    return (
+        len(rows) >= MIN_NUMBER_ROWS
+        and min(widths) == max(widths) >= MIN_NUMBERS
+        and all(map(_consists_of_numbers, rows))
+    )
 
 
 def split_fields(line: str, separator: str) -> list[str]:
@@ -173,7 +226,7 @@ def split_header(line: str, separator: str | None = None) -> list[str]:
     By default, the separator is the first of SEPARATORS that the line contains.
     """
     names = line.lstrip("#% ")
-    fields = split_fields(names, _first_separator(names) if separator is None else separator)
+    fields = split_fields(names, find_separator(names) if separator is None else separator)
     return [name.strip(' \t"') for name in fields]
 
 
@@ -193,14 +246,17 @@ def _decode(line: bytes) -> str:
         return line.decode("cp1252", errors="replace")  # the degree sign and the superscript of old programs
 
 
-def _first_separator(line: str) -> str:
+def find_separator(line: str) -> str:
+    """Return the first of SEPARATORS that a line contains outside of quotes."""
     outside = _QUOTED.sub("", line)
     return next((separator for separator in SEPARATORS if separator and separator in outside), BLANKS)
 
 
 def _consists_of_numbers(line: str) -> bool:
-    separator = _first_separator(line)
+    separator = find_separator(line)
     fields = split_fields(line, separator)
+    if len(fields) > 1:
+        fields = [field for field in fields if not is_text_time(field)]
     if separator == ",":  # a decimal comma and blanks also look like commas
         fields = [part for field in fields for part in (field.split() or [""])]
     return any(field.strip() for field in fields) and all(parse_number(one, separator) is not None for one in fields)
@@ -211,7 +267,7 @@ def _is_header_comment(comment: str, line: str) -> bool:
     names = split_header(comment)
     if names_an_axis(names):
         return not names_an_axis(split_header(line))
-    alike = _first_separator(comment.lstrip("#% ")) == _first_separator(line)
+    alike = find_separator(comment.lstrip("#% ")) == find_separator(line)
     return alike and _consists_of_numbers(line) and len(names) == len(split_header(line)) > 1
 
 
@@ -224,7 +280,7 @@ def _build_header(path: Path, label: Path, header: _Line, rows: Sequence[_Line],
             f"{table.describe_suffix_mismatch(path)}"
         )
     sample = rows[0].text if rows else None
-    separator = _first_separator(names_text) if sample is None else _find_separator(label, header, sample)
+    separator = find_separator(names_text) if sample is None else _find_common_separator(label, header, sample)
     table.check_column_count(label, names_text.count(separator or " ") + 1)
     names = split_header(names_text, separator)
     units = [] if sample is None else [field.strip() for field in split_fields(sample, separator)]
@@ -233,6 +289,8 @@ def _build_header(path: Path, label: Path, header: _Line, rows: Sequence[_Line],
         pairs = zip_longest(names, units[: len(names)], fillvalue="")
         names = [_append_unit(name, unit) for name, unit in pairs]
         rows = rows[1:]
+        while rows and _describes_columns(rows[0].text, separator):
+            rows = rows[1:]
         sample = rows[0].text if rows else None
     fields = [] if sample is None else split_fields(sample, separator)
     if len(fields) == len(names) + 1 and not fields[-1].strip():
@@ -250,12 +308,19 @@ def _is_unit_row(fields: Sequence[str], columns: int) -> bool:
     return 2 * len(known) >= len(given) and all(parse_number(field, ",") is None for field in given)
 
 
+def _describes_columns(line: str, separator: str) -> bool:
+    """Return True if a line after the units contains only text, such as the sources of the columns."""
+    given = [field for field in split_fields(line, separator) if field.strip()]
+    return len(given) > 1 and all(parse_number(field, separator) is None and not is_text_time(field) for field in given)
+
+
 def _append_unit(name: str, unit: str) -> str:
-    unit = unit.strip("[]() ")
+    found = _ENCLOSED.fullmatch(unit)
+    unit = found[1] if found else unit
     return name if unit in NO_UNITS or split_unit(name)[1] is not None else f"{name} [{unit}]"
 
 
-def _find_separator(label: Path, header: _Line, sample: str) -> str:
+def _find_common_separator(label: Path, header: _Line, sample: str) -> str:
     """Return the separator of header and samples.
 
     Raises
@@ -263,12 +328,12 @@ def _find_separator(label: Path, header: _Line, sample: str) -> str:
     RecordingError
         If header and samples have different separators, or if decimal commas cannot be told from separators.
     """
-    of_sample = _first_separator(sample)
+    of_sample = find_separator(sample)
     for separator in (",", *SEPARATORS):  # the names in a header contain no decimal commas
         columns, fields = len(split_header(header.text, separator)), len(split_fields(sample, separator))
         if columns > 1 and fields in (columns, columns + 1) and (separator != BLANKS or of_sample == BLANKS):
             return separator
-    separator = _first_separator(header.text.lstrip("#% "))
+    separator = find_separator(header.text.lstrip("#% "))
     columns, fields = len(split_header(header.text)), len(split_fields(sample, of_sample))
     if columns == 1:
         return ","
@@ -285,20 +350,32 @@ def _find_separator(label: Path, header: _Line, sample: str) -> str:
     return separator or ","
 
 
-def _build_numbered(label: Path, line: _Line, options: ReadingOptions, rest: bytes) -> CsvHeader:
+def _build_numbered(label: Path, line: _Line, options: ReadingOptions, rest: bytes, sensor: str) -> CsvHeader:
     """Return the header of a file without a header line, whose columns the user selects by number."""
     given = [column for column in options.columns.values() if column != NOT_READ]
-    if not given or not all(column.isdecimal() for column in given):
-        raise RecordingError(
-            f"{label}: the header line is missing: line {line.number} consists of numbers; expected a header line "
-            f"such as {table.EXAMPLE_HEADER}, or the numbers of the columns, such as --columns t=1,gx=2"
-        )
-    separator = _first_separator(line.text)
+    if not all(column.isdecimal() for column in given):
+        raise RecordingError(f"{label}: {describe_missing_header(line.number)}, such as --columns t=1,gx=2")
+    separator = find_separator(line.text)
     fields = split_fields(line.text, separator)
-    if separator == "," and any(len(field.split()) > 1 for field in fields):
+    if separator == "," and any(len(field.split()) > 1 and not is_text_time(field) for field in fields):
         raise RecordingError(
             f"{label}: line {line.number} has commas and blanks, and either can be the separator or the decimal comma; "
             "export the file with semicolons or tabs"
         )
     names = [f"column {i}" for i in range(1, len(fields) + 1)]
+    first = [
+        parse_number(split_fields(one.text, separator)[0], separator)
+        for one in _iter_lines(rest[:MAX_TABLE_START_BYTES], 0)
+    ]
+    increases = len(first) > 2 and all(a is not None and b is not None and a < b for a, b in pairwise(first))
+    if len(fields) == len(SENSOR_FIELDS) and names_sensor_kind(sensor) and not given and increases:
+        names = [*SENSOR_FIELDS]
     return CsvHeader(names, separator, 0, rest, line.number, line.text)
+
+
+def describe_missing_header(line_number: int) -> str:
+    """Return the problem of a file without column names."""
+    return (
+        f"the header line is missing: line {line_number} consists of numbers; expected a header line such as "
+        f"{table.EXAMPLE_HEADER}, or the numbers of the columns"
+    )

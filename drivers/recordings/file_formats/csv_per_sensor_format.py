@@ -20,11 +20,13 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import table
+from drivers.recordings.column_names import names_sensor_kind
 from drivers.recordings.file_formats.csv_format import (
     CsvSource,
     read_csv_column_names,
     read_csv_source,
 )
+from drivers.recordings.file_formats.csv_row_kinds import find_row_sources
 from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import convert_to_si, find_layout
@@ -35,12 +37,22 @@ ACCELEROMETERS: Final = ("TotalAcceleration", "Accelerometer", "AccelerometerUnc
 """Names of files, the preferred name first."""
 MAX_FILES: Final = 100
 """Maximum number of CSV files that are searched for sensors."""
+TABLE_SUFFIXES: Final = (".csv", ".txt", ".dat", ".tsv")
 EXPECTED: Final = "CSV files of sensors, such as Gyroscope.csv and Accelerometer.csv"
 
 
 def is_sensor_folder(path: Path) -> bool:
-    """Return True if a folder contains a CSV file that is named after a sensor."""
-    return path.is_dir() and any((path / f"{name}.csv").is_file() for name in (*GYROSCOPES, *ACCELEROMETERS))
+    """Return True if a folder contains a file of a phone app, or one table of each of the two sensors."""
+    if not path.is_dir():
+        return False
+    if any((path / f"{name}.csv").is_file() for name in (*GYROSCOPES, *ACCELEROMETERS)):
+        return True
+    kinds = [names_sensor_kind(one.stem) for one in _list_tables(path)]
+    return kinds.count("g") == kinds.count("a") == 1
+
+
+def _list_tables(folder: Path) -> list[Path]:
+    return sorted(one for one in folder.iterdir() if one.suffix.lower() in TABLE_SUFFIXES)[:MAX_FILES]
 
 
 def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
@@ -74,11 +86,15 @@ def _select(
     """Return the names of the sensors to read."""
     topics = [_describe(source, name, options) for name, source in sources.items()]
     measured = {topic.name: topic.columns for topic in topics}
-    gyros = _by_preference(GYROSCOPES, [name for name, columns in measured.items() if {*columns} & {*GYROS}])
-    others = [name for name, columns in measured.items() if {*columns} & {*AXES} and name not in gyros]
+    whole = [name for name, columns in measured.items() if {*columns} & {*GYROS} and {*columns} & {*AXES[3:]}]
+    single = {name: columns for name, columns in measured.items() if name not in whole}
+    gyros = _by_preference(GYROSCOPES, [name for name, columns in single.items() if {*columns} & {*GYROS}])
+    others = [name for name, columns in single.items() if {*columns} & {*AXES} and name not in gyros]
     accelerometers = _by_preference(ACCELEROMETERS, others)
-    pairs = [JOIN.join((gyro, one)) for gyro in gyros[:1] for one in accelerometers if gyro in GYROSCOPES]
-    imus = [[name] for name in (pairs or [*gyros, *accelerometers])]
+    known = bool(gyros) and gyros[0] in GYROSCOPES
+    pairs = [JOIN.join((gyro, one)) for gyro in (gyros[:1] if known else gyros) for one in accelerometers]
+    names = [*whole, *(pairs or [*gyros, *accelerometers])]
+    imus = [[name] for name in names] if known or len(whole) == 1 else [names]
     return select_topics(path, topics, imus, topic, EXPECTED, notes)
 
 
@@ -92,7 +108,7 @@ def _describe(source: CsvSource, name: str, options: ReadingOptions) -> Recorded
         names = read_csv_column_names(source, options)
         columns = tuple(find_layout(Path(source.label), names, options, [], sensor=source.sensor).columns)
     except (ConfigError, RecordingError):
-        if name in (*GYROSCOPES, *ACCELEROMETERS):
+        if name in (*GYROSCOPES, *ACCELEROMETERS) or names_sensor_kind(name) == "g":
             raise
         return RecordedTopic(name, "other columns", (), 0)
     return RecordedTopic(name, "CSV", columns, 1)
@@ -102,8 +118,11 @@ def _describe(source: CsvSource, name: str, options: ReadingOptions) -> Recorded
 def _open_sources(path: Path) -> Iterator[dict[str, CsvSource]]:
     """Yield the CSV files of a folder or a zip archive by name, without the suffix."""
     if path.is_dir():
-        files = sorted(one for one in path.iterdir() if one.suffix.lower() == ".csv")[:MAX_FILES]
+        files = _list_tables(path)
         yield {one.stem: CsvSource(one, str(one), one.stem, partial(open_regular_file, one)) for one in files}
+        return
+    if rows := find_row_sources(path):
+        yield rows
         return
     with IndexSizeLimitedFile(path) as file:
         try:

@@ -22,6 +22,7 @@ from drivers.data_types import Floats
 from drivers.errors import ImuError, RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.column_guess import EXAMINED_ROWS
 from drivers.recordings.reading_options import ReadingOptions
 from drivers.recordings.table_layout import find_layout
 
@@ -58,7 +59,7 @@ def read_matlab(path: Path, options: ReadingOptions) -> table.Table:
     notes: list[str] = []
     columns, fs = _load_columns(path, notes)
     names = list(columns)
-    layout = find_layout(path, names, options, notes)
+    layout = find_layout(path, names, options, notes, read_column=lambda i: columns[names[i]][:EXAMINED_ROWS])
     found = {quantity: table.to_column(quantity, columns[names[i]]) for quantity, i in layout.columns.items()}
     return table.Table(found, fs, notes, layout.units, layout.names)
 
@@ -75,7 +76,7 @@ def _load_columns(path: Path, notes: list[str]) -> tuple[dict[str, Floats], floa
                 if name in RATE_NAMES and array.size == 1:
                     fs = float(array.item())
                 elif array.ndim == 2 and array.size:
-                    columns |= _name_columns(name, array)
+                    columns |= table.name_matrix_columns(name, array)
                     limit.check_row_count(max(array.shape))
                 table.check_column_count(path, len(columns))
         except ImuError:
@@ -206,13 +207,3 @@ def _iter_arrays(prefix: str, content: _Content, depth: int, field: str | None =
             _, data = content.read_element()
             one = text[start : start + length].rstrip("\0")
             yield from _iter_arrays(f"{name}.", _Content(data, content.order), depth + 1, one)
-
-
-def _name_columns(name: str, array: Any) -> dict[str, Floats]:
-    """Return the columns of a matrix by name. The longer side of a matrix is the time."""
-    columns = array if array.shape[0] >= array.shape[1] else array.T
-    width = columns.shape[1]
-    if width == 1:
-        return {name: columns[:, 0]}
-    endings = "xyz" if width == 3 else map(str, range(1, width + 1))
-    return {f"{name}_{ending}": column for ending, column in zip(endings, columns.T, strict=True)}

@@ -1,4 +1,4 @@
-"""Reading and writing of .npz recordings with one array per column.
+"""Reading and writing of .npz recordings with one array per column, or with matrices such as ``gyro`` of shape n×3.
 
 The sample rate ``fs`` in Hz can replace the times ``t``.
 
@@ -14,7 +14,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -25,12 +25,13 @@ from typing import IO, Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import RecordingError
+from drivers.errors import ImuError, RecordingError
 from drivers.host.safe_file_reading import open_regular_file
 from drivers.recordings import memory_check, table
+from drivers.recordings.column_guess import EXAMINED_ROWS
 from drivers.recordings.file_formats.zip_index import IndexSizeLimitedFile
 from drivers.recordings.reading_options import ReadingOptions
-from drivers.recordings.table_layout import TableLayout, find_layout, is_known_column
+from drivers.recordings.table_layout import find_layout, is_known_column
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # local file header, PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -42,14 +43,16 @@ COPY_BYTES: Final = 1 << 18
 MAX_HEADER_BYTES: Final = 1 << 16
 MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
+MAX_MATRIX_COLUMNS: Final = 64
+"""Largest number of columns of a matrix that is read."""
 NUMERIC_KINDS: Final = "fiu"
 """Values of ``numpy.dtype.kind`` that a column may have: float, signed integer and unsigned integer."""
 NPY_HEADER: Final = re.compile(
-    rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
-    rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
+    rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?P<fortran>False|True), "
+    rb"'shape': \((?:(?P<n>\d{1,18}),(?: (?P<m>[1-9]\d?))?)?\), } *\n",
     re.DOTALL,
 )
-"""Pattern of the .npy header of a numeric array with at most one dimension, as all versions of NumPy write it.
+"""Pattern of the .npy header of a numeric array with at most two dimensions, as all versions of NumPy write it.
 
 The header is matched by a regular expression and never evaluated as Python code.
 """
@@ -83,13 +86,27 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
     with IndexSizeLimitedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                names = _array_names(archive)
-                layout = find_layout(path, names, options, notes)
-                _check_columns(path, archive, names, layout)
+                keys = _find_column_keys(path, archive)
+                pairs = list(keys.items())
+
+                def read_column(i: int) -> NDArray[Any]:
+                    name, key = pairs[i]
+                    try:
+                        _check_columns(path, archive, [key])
+                        return _take_column(_read_array(path, archive, key), name, key)[:EXAMINED_ROWS]
+                    except ImuError:  # an array of another type or shape
+                        return np.empty(0)
+
+                layout = find_layout(path, list(keys), options, notes, read_column=read_column)
+                used = {quantity: pairs[i] for quantity, i in layout.columns.items()}
+                _check_columns(path, archive, [key for _, key in used.values()])
+                arrays = {
+                    key: _read_array(path, archive, key) for key in dict.fromkeys(key for _, key in used.values())
+                }
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {
-                        quantity: table.to_column(quantity, _read_array(path, archive, names[i]))
-                        for quantity, i in layout.columns.items()
+                        quantity: table.to_column(quantity, _take_column(arrays[key], name, key))
+                        for quantity, (name, key) in used.items()
                     }
                 return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units, layout.names)
     arrays, cut = _recover_arrays(path, options)
@@ -125,21 +142,40 @@ def _array_names(archive: zipfile.ZipFile) -> list[str]:
     return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
+def _find_column_keys(path: Path, archive: zipfile.ZipFile) -> dict[str, str]:
+    """Return the name of the array for each column. A matrix has several columns (``table.name_matrix_columns``)."""
+    names = _array_names(archive)
+    table.check_column_count(path, len(names))
+    keys: dict[str, str] = {}
+    for key in names:
+        shape: tuple[int, ...] = ()
+        with suppress(RecordingError):  # an error is reported only if the array is used
+            shape = _read_header(path, archive, key).shape
+        is_matrix = len(shape) == 2 and 1 <= min(shape) <= MAX_MATRIX_COLUMNS and key not in table.COLUMNS
+        columns = table.name_matrix_columns(key, np.broadcast_to(np.uint8(0), shape)) if is_matrix else (key,)
+        keys |= dict.fromkeys(columns, key)
+    return keys
+
+
+def _take_column(array: NDArray[Any], name: str, key: str) -> NDArray[Any]:
+    return table.name_matrix_columns(key, array)[name] if array.ndim == 2 else array
+
+
 def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     names = archive.NameToInfo
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _check_columns(path: Path, archive: zipfile.ZipFile, names: Sequence[str], layout: TableLayout) -> None:
+def _check_columns(path: Path, archive: zipfile.ZipFile, keys: Sequence[str]) -> None:
     """Check the array headers of all columns."""
     limit = memory_check.measure_read_limit(path)
-    for key in (names[i] for i in layout.columns.values()):
+    for key in keys:
         header = _read_header(path, archive, key)
         if header.dtype.kind not in NUMERIC_KINDS:
             raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
-        if len(header.shape) != 1:
+        if len(header.shape) != 1 and (len(header.shape) != 2 or key in table.COLUMNS):
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
-        limit.check_row_count(header.values)
+        limit.check_row_count(header.values if len(header.shape) == 1 else max(header.shape))
         _check_size(path, limit, _find_member(archive, key), key, header)
 
 
@@ -223,17 +259,20 @@ def _table_of_recovered(
     path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, options: ReadingOptions, notes: list[str]
 ) -> table.Table:
     """Return the arrays of a truncated archive as a ``Table``. Pad the truncated column with NaN."""
-    names = list(arrays)
+    keys: dict[str, str] = {}
+    for key, array in arrays.items():
+        keys |= dict.fromkeys(table.name_matrix_columns(key, array) if array.ndim == 2 else (key,), key)
+    names = list(keys)
     layout = find_layout(path, names, options, notes)
     columns = {}
-    for name, key in ((quantity, names[i]) for quantity, i in layout.columns.items()):
-        if arrays[key].ndim != 1:
-            raise RecordingError(f"{path}: {key} has shape {arrays[key].shape}, expected one dimension")
-        columns[name] = table.to_column(name, arrays[key])
-    short = next((quantity for quantity, i in layout.columns.items() if names[i] == cut), None)
-    if short is not None:
+    for quantity, name in ((quantity, names[i]) for quantity, i in layout.columns.items()):
+        array = _take_column(arrays[keys[name]], name, keys[name])
+        if array.ndim != 1:
+            raise RecordingError(f"{path}: {name} has shape {array.shape}, expected one dimension")
+        columns[quantity] = table.to_column(quantity, array)
+    n = max(column.size for column in columns.values())
+    for short in [quantity for quantity, i in layout.columns.items() if keys[names[i]] == cut]:
         column = columns[short]
-        n = max(other.size for other in columns.values())
         rest = np.full(n - column.size, np.nan if column.dtype == np.float64 else table.NO_TIME_NS)
         columns[short] = np.concatenate([column, rest])
     fs = _single_number(arrays["fs"], notes) if "fs" in arrays else None
@@ -262,7 +301,8 @@ def _recover_arrays(path: Path, options: ReadingOptions) -> tuple[dict[str, NDAr
                 packed = int.from_bytes(extra[12:20], "little")
             start += extra_size
             pieces = _MemberReader(data, start, method, None if flags & 8 else packed)
-            array = _read_up_to_cut(pieces, limit, unpacked, wanted=key == "fs" or is_known_column(key, options))
+            wanted = key == "fs" or any(is_known_column(name, options) for name in (key, f"{key}_x"))
+            array = _read_up_to_cut(pieces, limit, unpacked, wanted=wanted)
             unpacked += pieces.unpacked
             if array is not None:
                 arrays[key] = array
@@ -331,14 +371,16 @@ def _read_up_to_cut(
         if header is None and (header := NPY_HEADER.match(raw)) is not None:
             header = NPY_HEADER.match(bytes(raw[: header.end()]))
             assert header is not None
-            dtype, n = np.dtype(header["kind"].decode()), int(header["n"] or 1)
-            most = header.end() + (n * dtype.itemsize if wanted else 0)
+            dtype, n, width = np.dtype(header["kind"].decode()), int(header["n"] or 1), int(header["m"] or 1)
+            most = header.end() + (n * width * dtype.itemsize if wanted else 0)
         if header is not None and wanted:
-            limit.check_row_count(min(n, (len(raw) - header.end()) // dtype.itemsize))
-    if header is None:
+            limit.check_row_count(min(n, (len(raw) - header.end()) // (width * dtype.itemsize)))
+    if header is None or (header["m"] and (header["fortran"] == b"True" or n < width)):
         return None
-    complete = (len(raw) - header.end()) // dtype.itemsize if wanted else 0
-    array = np.frombuffer(raw, dtype, min(n, complete), header.end())
+    complete = (len(raw) - header.end()) // (width * dtype.itemsize) if wanted else 0
+    array = np.frombuffer(raw, dtype, width * min(n, complete), header.end())
+    if header["m"]:
+        return array.reshape(-1, width) if complete >= width else None
     return array if header["n"] or not array.size else array.reshape(())
 
 

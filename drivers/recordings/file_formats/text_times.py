@@ -1,7 +1,7 @@
 """Times that a table contains as text: ISO 8601 dates with times, and times of day.
 
 The results are integers in ns. A date that does not begin with the year is ignored, because the order of day and month
-is unknown, so only the time of day is used. Times of day continue after midnight (``unwrap_days``).
+is unknown, so only the time of day is used. Times of day continue after midnight (``table.unwrap_times``).
 """
 
 import re
@@ -9,9 +9,6 @@ from datetime import date
 from functools import lru_cache
 from typing import Final
 
-import numpy as np
-
-from drivers.data_types import Ints
 from drivers.recordings.table import NO_TIME_NS
 
 DAY_NS: Final = 86_400 * 10**9
@@ -69,13 +66,3 @@ def parse_text_time(field: str) -> int:
 def _days_since_1970(text: str) -> int:
     year, month, day = map(int, re.split("[-/.]", text))
     return date(year, month, day).toordinal() - date(1970, 1, 1).toordinal()
-
-
-def unwrap_days(t_ns: Ints) -> Ints:
-    """Return times of day that continue after midnight."""
-    present = np.flatnonzero(t_ns != NO_TIME_NS)
-    steps = np.diff(t_ns[present])
-    days = np.cumsum((steps < -DAY_NS // 2).astype(np.int64) - (steps > DAY_NS // 2))
-    result = t_ns.copy()
-    result[present[1:]] += DAY_NS * days
-    return result

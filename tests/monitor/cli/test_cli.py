@@ -726,7 +726,6 @@ def test_allan_deviations_equal_allantools(run_program: RunProgram, recording: P
             b"gx\n" + b"0.1\n" * 100,
             "x.csv: has neither t nor fs, so its rate is not known; give it with --rate",
         ),
-        ("x.csv", b"t,speed\n" + b"0.1,1\n" * 100, "x.csv: no axis among its columns"),
         ("x.csv", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv: no axis among its columns"),
         ("x.npz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.npz: is no .npz file"),
         ("x.csv.gz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv.gz: "),
@@ -741,6 +740,20 @@ def test_invalid_recording_is_reported_in_one_line(
     assert run.status == 2
     assert message in run.require_one_error_line()
     assert not Path("x.json").exists()
+
+
+def test_unknown_columns_are_printed_below_the_message(run_program: RunProgram) -> None:
+    Path("x.csv").write_text("t,speed\n0.1,3\n0.2,4\n0.3,5\n0.4,6\n")
+    run = run_program("analyze", "x.csv")
+    assert (run.status, run.out) == (2, "")
+    message, *columns = run.err.splitlines()
+    assert message.startswith("imu-monitor: x.csv: no axis among its columns (t, speed)")
+    assert message.endswith("such as imu-monitor analyze x.csv --columns gx=speed")
+    assert [line.split() for line in columns] == [
+        ["column", "guess", "name", "first", "values"],
+        ["1", "t", "t", "0.1", "0.2", "0.3"],
+        ["2", "speed", "3", "4", "5"],
+    ]
 
 
 def test_folder_without_recordings_is_refused(run_program: RunProgram) -> None:
@@ -1082,10 +1095,10 @@ def test_reconcile_refuses_an_invalid_recording(run_program: RunProgram) -> None
     run = run_program("reconcile", "nowhere.csv", "--out", "found")
     assert run.status == 2
     assert "nowhere.csv: cannot be read: No such file or directory" in run.require_one_error_line()
-    Path("x.csv").write_bytes(b"t,speed\n" + b"0.1,1\n" * 100)
+    Path("x.csv").write_bytes(b"t,gx\n")
     run = run_program("reconcile", "x.csv", "--out", "found")
     assert run.status == 2
-    assert "x.csv: no axis among its columns" in run.require_one_error_line()
+    assert "x.csv: has a header line but no complete line of samples" in run.require_one_error_line()
     assert not list(Path().glob("found/*"))
 
 
