@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
-from llvmlite import binding, ir
 from numpy.typing import NDArray
 
 _masked = "scipy" not in sys.modules
@@ -220,32 +219,6 @@ def _remove_owner(context: Any, builder: Any, signature: Any, arguments: Any) ->
     array.meminfo = context.get_constant_null(types.MemInfoPointer(signature.return_type.dtype))
     array.parent = context.get_constant_null(types.pyobject)
     return array._getvalue()  # noqa: SLF001
-
-
-def int_to_float(value: int) -> float:
-    """Return a 64-bit integer as a float, rounded to the nearest float. Loops that call this function are vectorized.
-
-    Only AVX-512 converts vectors of 64-bit integers on x86. For other x86 processors, LLVM would convert one element
-    after the other. Therefore, the upper and the lower 32 bits become mantissas of two floats, whose sum is the result.
-    """
-    return float(value)
-
-
-@type_callable(int_to_float)  # type: ignore[untyped-decorator]
-def _infer_float(_context: Any) -> Callable[[Any], Any]:
-    return lambda _value: types.float64
-
-
-@lower_builtin(int_to_float, types.int64)  # type: ignore[untyped-decorator]
-def _convert_int(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-    if not binding.get_process_triple().startswith("x86") or binding.get_host_cpu_features().get("avx512dq"):
-        return builder.sitofp(arguments[0], ir.DoubleType())
-    integer, double = ir.IntType(64), ir.DoubleType()
-    shifted = builder.xor(arguments[0], integer(-(1 << 63)))  # value + 2⁶³ as an unsigned integer
-    upper = builder.or_(builder.lshr(shifted, integer(32)), integer(0x453 << 52))  # mantissa of a float from 2⁸⁴
-    lower = builder.or_(builder.and_(shifted, integer(0xFFFFFFFF)), integer(0x433 << 52))  # of a float from 2⁵²
-    upper = builder.fsub(builder.bitcast(upper, double), double(2.0**84 + 2.0**63 + 2.0**52))
-    return builder.fadd(upper, builder.bitcast(lower, double))
 
 
 def kernel_cache_folder() -> Path | None:

@@ -33,6 +33,7 @@ from monitor.estimation.allan.squared_difference_moments import (
 )
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
+from monitor.estimation.allan.window_kernel import MAX_ROUNDING_SQUARE as MAX_ROUNDING_SQUARE_OF_WINDOW
 
 TOTAL, HADAMARD = 0, 1
 MIN_SAMPLES: Final = 8
@@ -42,8 +43,8 @@ MOMENTS_RENEWAL_RATIO: Final = 1.02
 MAX_ROUNDING_SQUARE: Final = (25.0, 45.0)
 """Largest squared difference of the total and the Hadamard variance that rounding can cause, in squared units of phase.
 
-Each value is (Σ |w| / 2)², where w are the weights of the phase points in a difference if 40 % of each cluster are
-missing.
+Each value is (Σ |w| / 2)², where w are the weights of the phase points in a difference. If samples are missing,
+``window_kernel.MAX_ROUNDING_SQUARE`` applies.
 """
 
 
@@ -170,7 +171,8 @@ class LiveTotalAndHadamard:
     def _correct(self, statistic: int, m: int, sums: _Sums) -> tuple[Floats, Floats]:
         """Return the variance [6] and the contribution of missing samples [6], which has been subtracted."""
         _, unit = self._ring()
-        squares = np.where(sums.squares <= MAX_ROUNDING_SQUARE[statistic] * sums.terms, 0.0, sums.squares) * unit**2
+        limit = np.where(sums.extra != 0.0, MAX_ROUNDING_SQUARE_OF_WINDOW, MAX_ROUNDING_SQUARE[statistic])
+        squares = np.where(sums.squares <= limit * sums.terms, 0.0, sums.squares) * unit**2
         factor = np.array([m])
         within = variance_within_clusters_from_octaves(self._allan, factor)
         variance, excess = correct_squared_differences(

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
+from monitor.common.compiled_vectors import LANES
 from monitor.estimation.allan.missing_samples import AllanVariances, variance_within_clusters
 from monitor.estimation.allan.window_kernel import (
     AXES,
     EXCESS_UNIT,
-    LANES,
     LAST_MISSING,
     LAST_PARTIAL,
     LINE,
@@ -39,7 +39,6 @@ from monitor.estimation.allan.window_kernel import (
     NEWEST,
     STAGE_SAMPLES,
     TOTAL,
-    WIDTH,
     WindowBuffers,
     append_staged_samples,
     copy_variances,
@@ -184,7 +183,7 @@ class AllanWindow:
         self._terms[:], self._excess[:] = 0, 0
         self._sums[:] = self._rest[:] = 0.0
         self._scaling[:LANES], self._scaling[LANES:] = self._scale, 0.0
-        self._state[[TOTAL, LAST_MISSING, LAST_PARTIAL, WIDTH]] = (0, -(1 << 62), -(1 << 62), LANES)
+        self._state[[TOTAL, LAST_MISSING, LAST_PARTIAL]] = (0, -(1 << 62), -(1 << 62))
 
     def append_samples(self, values: Floats) -> None:
         """Append samples to the window. If the window is full, the oldest samples are removed.

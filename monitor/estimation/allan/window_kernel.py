@@ -4,24 +4,34 @@ The arithmetic is described in the module ``window``. All data of a window is st
 that Python passes to compiled code costs 50 ns.
 """
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
-from monitor.common.compiled import compiled, inlined, int_to_float, without_reference_count
+from monitor.common.compiled import compiled, inlined, without_reference_count
+from monitor.common.compiled_vectors import (
+    LANES,
+    broadcast,
+    load_column,
+    load_vector,
+    prefetch,
+    store_vector,
+    sum_vector,
+    to_floats,
+    to_integers,
+)
 from monitor.estimation.allan.missing_samples import MIN_PRESENT_SHARE, min_present, subtract_excess
 
 AXES: Final = 6
-LANES: Final = 8
-"""Number of columns per sample: six axes and two columns of padding."""
-TOTAL, NEWEST, LAST_MISSING, WIDTH, LAST_PARTIAL = 0, 1, 2, 3, 4
+MISSING_ROWS: Final = 6
+"""Column of the phase that contains the running count of samples that are missing on at least one axis."""
+TOTAL, NEWEST, LAST_MISSING, LAST_PARTIAL = 0, 1, 2, 3
 """Indices of the elements of the state array.
 
 The elements are the number of samples since the last reset, the row of the newest phase point, the number of the newest
-missing sample, ``LANES``, and the number of the newest sample that is missing on some axes only. The compiled code
-reads ``LANES`` from the array, because a loop of constant length would not be vectorized.
+missing sample, and the number of the newest sample that is missing on some axes only.
 """
 RUN_SAMPLES: Final = 64
 """Maximum number of samples whose phase is stored before the sums of squared differences are updated."""
@@ -29,12 +39,20 @@ STAGE_SAMPLES: Final = 512
 """Maximum number of samples that are passed to the compiled code at a time."""
 LINE: Final = 8
 """Number of 8-byte numbers in a cache line."""
+ROUNDING: Final = 1.5 * 2.0**52
+"""Number that rounds to a whole number when it is added and subtracted."""
 EXCESS_UNIT: Final = 2.0**-38
 """Unit of ``WindowArrays.excess``. The sum of 10⁷ terms stays below 2⁶³."""
-MAX_ROUNDING_SQUARE: Final = 12.0
-"""Largest square, in squared units of phase, that rounding causes if 40 % of a cluster are missing."""
-DISCARDED: Final = 1 << 30
-"""Step of the count of missing samples before the oldest sample that an axis keeps."""
+MAX_ROUNDING_SQUARE: Final = 2.0**14
+"""Largest mean square, in squared units of phase, that rounding causes if samples are missing.
+
+For constant full-scale input and a burst of missing samples that is as long as a cluster permits, it is 11 000.
+"""
+DISCARDED: Final = 1 << 24
+"""Step of the count of missing samples before the oldest sample that an axis keeps.
+
+The step is larger than any window, and the sum of several steps stays below 2³¹.
+"""
 LEVEL: Final = 64
 """Number of newest samples whose mean is the reference level of an axis."""
 NEVER: Final = 1 << 62
@@ -46,6 +64,12 @@ BEND_POINTS: Final = 64
 
 The resulting error is 1 % of the standard deviation of the sum.
 """
+
+
+CACHED_ROWS: Final = 8192
+"""Number of rows of phase that fit into the cache of a processor core."""
+Offsets = tuple[np.uintp, np.uintp, np.uintp]
+"""Offsets of the newest, the middle and the oldest phase point of a second difference in the ring buffer."""
 
 
 class WindowBuffers(NamedTuple):
@@ -68,7 +92,7 @@ class WindowArrays(NamedTuple):
     first: Ints  # [m] field of ``VarianceWithinClusters``
     phase: Ints  # [places · LANES] ring buffer of integer phase
     scaling: Floats  # [2 · LANES] scale factors to integer phase, and rounding errors to add to the next sample
-    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares to add to the sums, and squares to subtract
+    scratch: Floats  # [4 · LANES] weights of eight differences
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
@@ -79,7 +103,7 @@ class WindowArrays(NamedTuple):
 def window_memory_size(length: int, taus: int) -> int:
     """Return the number of 8-byte numbers that a window of ``length`` samples with ``taus`` cluster sizes needs."""
     header = LANES + (4 * taus + LINE - 1) // LINE * LINE + (taus * taus + LINE - 1) // LINE * LINE
-    samples = 2 + 2 * RUN_SAMPLES + 4 * taus + STAGE_SAMPLES
+    samples = 6 + 4 * taus + STAGE_SAMPLES
     return header + samples * LANES + (length + 1 + RUN_SAMPLES) * (LANES + LANES // 2)
 
 
@@ -96,7 +120,7 @@ def view_window_arrays(memory: Ints, taus: int) -> WindowArrays:
     excess = terms + taus * LANES
     scaling = excess + taus * LANES
     scratch = scaling + 2 * LANES
-    sums = scratch + 2 * RUN_SAMPLES * LANES
+    sums = scratch + 4 * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
     phase = stage + STAGE_SAMPLES * LANES
     missing = phase + (memory.size - phase) // 3 * 2  # a count of missing samples takes half the memory of a phase
@@ -146,52 +170,9 @@ def append_staged_samples(memory: Ints, taus: int, start: int, n: int) -> None:
         count = state[TOTAL] - run  # number of samples before this run of samples
         whole = count - state[LAST_MISSING] > length
         shared = count - state[LAST_PARTIAL] > length
-        if run == 1 and shared and count >= length:
-            for row in range(0, taus, RUN_SAMPLES):
-                some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
-                _replace_terms(
-                    first, whole, factors[some], spans[some], phase, missing, scratch, terms[lanes], excess[lanes],
-                    sums[lanes], rest[lanes],
-                )  # fmt: skip
-        else:
-            _add_run(
-                first, run, count, whole, shared, factors, spans, phase, missing, scratch, terms, excess, sums, rest,
-                state[WIDTH],
-            )  # fmt: skip
-
-
-@compiled
-def _add_run(
-    first: int,
-    run: int,
-    count: int,
-    whole: bool,
-    shared: bool,
-    factors: Ints,
-    spans: Ints,
-    phase: Ints,
-    missing: NDArray[np.int32],
-    scratch: Floats,
-    terms: Ints,
-    excess: Ints,
-    sums: Floats,
-    rest: Floats,
-    lanes: int,
-) -> None:
-    """Update the sums of each τ with ``run`` new samples, whose phase begins at row ``first`` of the ring buffer."""
-    places = phase.size // LANES
-    for i in range(factors.size):
-        row = max(0, 2 * factors[i] - 1 - count)  # first new sample that completes a second difference
-        own = slice(i * LANES, (i + 1) * LANES)
-        while row < run:
-            # stop at the sample at which second differences begin to leave the window
-            now = first + row if first + row < places else first + row - places
-            leaving = count + row >= spans[i]
-            end = run if leaving else min(run, spans[i] - count)
-            row += _slide(
-                now, end - row, factors[i], spans[i], leaving, whole, shared,
-                phase, missing, scratch, terms[own], excess[own], sums[own], rest[own], lanes,
-            )  # fmt: skip
+        _add_run(
+            first, run, count, whole, shared, factors, spans, phase, missing, scratch, terms, excess, sums, rest
+        )  # fmt: skip
 
 
 @inlined
@@ -223,6 +204,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             lost += 1
         if missing[now + lane] != count:  # Skipping writes of zeros saves memory.
             missing[now + lane] = count
+    phase[now + MISSING_ROWS] = phase[before + MISSING_ROWS] + (lost > 0)
     if lost > 0:
         state[LAST_MISSING] = state[TOTAL]
         if lost < sample.size:
@@ -230,14 +212,14 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
 
 
 @compiled
-def _slide(
-    now: int,
-    rows: int,
-    m: int,
-    span: int,
-    leaving: bool,
+def _add_run(
+    first: int,
+    run: int,
+    count: int,
     whole: bool,
     shared: bool,
+    factors: Ints,
+    spans: Ints,
     phase: Ints,
     missing: NDArray[np.int32],
     scratch: Floats,
@@ -245,32 +227,39 @@ def _slide(
     excess: Ints,
     sums: Floats,
     rest: Floats,
-    lanes: int,
-) -> int:
-    """Update the sums of one τ with up to ``rows`` new phase points, and return the number of processed phase points.
-
-    Fewer than ``rows`` phase points are processed if a memory range reaches the end of the ring buffer.
-    """
+) -> None:
+    """Update the sums of each τ with ``run`` new samples, whose phase begins at row ``first`` of the ring buffer."""
     places = phase.size // LANES
-    old = now - span - 1
-    new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
-    old0, old1, old2 = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
-    run = min(rows, places - max(now, new1, new2, old0, old1, old2))
-    n = run * LANES
-    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
-    _square(phase, now, new1, new2, n, added)
-    if leaving:
-        _square(phase, old0, old1, old2, n, evicted)
-    else:
-        evicted[:n] = 0.0
-    if not whole:
-        _replace_incomplete(phase, missing, now, new1, new2, m, run, 1, shared, added, terms, excess, 0)
-        if leaving:
-            _replace_incomplete(phase, missing, old0, old1, old2, m, run, -1, shared, evicted, terms, excess, 0)
-    elif not leaving:
-        terms += run
-    _exchange(added, evicted, n, sums, rest, lanes)
-    return run
+    for i in range(factors.size):
+        m, span, own = factors[i], spans[i], i * LANES
+        row = max(0, 2 * m - 1 - count)  # first new sample that completes a second difference
+        while row < run:
+            # stop at the sample at which second differences begin to leave the window
+            leaving = count + row >= span
+            rows = (run if leaving else min(run, span - count)) - row
+            now = first + row if first + row < places else first + row - places
+            new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
+            old = now - span - 1
+            old0, old1, old2 = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
+            if not leaving:
+                old0 = old1 = old2 = now  # the difference of equal phase points is zero
+            if rows > 1:  # up to the end of the ring buffer
+                rows = min(rows, places - max(now, new1, new2, old0, old1, old2))
+            elif places > CACHED_ROWS:
+                for at in (new1, new2, old0, old1, old2):
+                    prefetch(phase, (at + 1) * LANES)
+            row += rows
+            if not leaving:
+                for lane in range(AXES):  # the functions below subtract one difference for each row
+                    terms[own + lane] += rows
+            new = (np.uintp(now * LANES), np.uintp(new1 * LANES), np.uintp(new2 * LANES))
+            gone = (np.uintp(old0 * LANES), np.uintp(old1 * LANES), np.uintp(old2 * LANES))
+            if whole or (shared and not _has_missing(phase, new, rows) and not _has_missing(phase, gone, rows)):
+                _exchange_complete(phase, new, gone, rows, sums, rest, own)
+            elif shared:
+                _exchange_shared(phase, new, gone, rows, m, scratch, sums, rest, terms, excess, own)
+            else:
+                _exchange_partial(phase, missing, new, gone, rows, m, sums, rest, terms, excess, own)
 
 
 @compiled
@@ -287,88 +276,188 @@ def ring_row(index: int, rows: int) -> int:
     return index if index >= 0 else index + rows
 
 
-@compiled
-def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> None:
-    i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
-    for i in range(np.uintp(n)):
-        d = int_to_float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
-        out[i] = d * d
+def weights_of_differences(older: Any, newer: Any, m: float, most: float) -> tuple[Any, Any, Any, Any]:
+    """Return the weights of second differences with missing samples.
+
+    Let n_A and n_B samples of the older and the newer cluster be present. From the second difference D = x₀ − 2x₁ + x₂
+    and the sum T = x₀ − x₂ of all present samples, m times the difference of the means of the present samples is
+
+        ½ (m/n_A + m/n_B) D + ½ (m/n_B − m/n_A) T.
+
+    The weight of D is exactly 1 if no sample is missing. Without missing samples, the difference is therefore D.
+
+    Parameters
+    ----------
+    older, newer : float, or vector of floats
+        Numbers of missing samples in the older and the newer cluster.
+    m : float
+        Cluster size in samples.
+    most : float
+        Largest number of missing samples in a cluster of a difference that counts.
+
+    Returns
+    -------
+    d_weight, t_weight : float, or vector of floats
+        Weights of D and T; zero if the difference does not count.
+    counted : float, or vector of floats
+        1.0 if the difference counts, otherwise 0.0.
+    excess : float, or vector of floats
+        m/n_A + m/n_B − 2 in ``EXCESS_UNIT``, rounded to whole numbers; zero if the difference does not count.
+    """
+    counted = (1.0 * (older <= most)) * (1.0 * (newer <= most))
+    share = counted / ((m - older) * (m - newer) + (1.0 - counted))  # 1/(n_A n_B)
+    excess = (m * (older + newer) - 2.0 * older * newer) * share
+    v = (newer - older) * (0.5 * m) * share
+    return counted + 0.5 * excess, v, counted, (excess / EXCESS_UNIT + ROUNDING) - ROUNDING
+
+
+_weights = inlined(weights_of_differences)
+_vector_weights = inlined(weights_of_differences)
+
+
+@inlined
+def _has_missing(phase: Ints, at: Offsets, rows: int) -> bool:
+    """Return True if samples are missing between the phase points of ``rows`` second differences."""
+    newest, oldest = at[0] + np.uintp((rows - 1) * LANES + MISSING_ROWS), at[2] + np.uintp(MISSING_ROWS)
+    return bool(phase[newest] != phase[oldest])
+
+
+@inlined
+def _exchange_complete(
+    phase: Ints, new: Offsets, gone: Offsets, rows: int, sums: Floats, rest: Floats, own: int
+) -> None:
+    """Add and subtract the squares of differences without missing samples."""
+    total, error = load_vector(sums, own), load_vector(rest, own)
+    for row in range(np.uintp(rows)):
+        k = row * np.uintp(LANES)
+        d, e = _second_difference(phase, new, k), _second_difference(phase, gone, k)
+        total, error = _exchange_squares(total, error, d * d, e * e)
+    store_vector(sums, own, total)
+    store_vector(rest, own, error)
+
+
+@inlined
+def _exchange_shared(
+    phase: Ints, new: Offsets, gone: Offsets, rows: int, m: int, scratch: Floats,
+    sums: Floats, rest: Floats, terms: Ints, excess: Ints, own: int,
+) -> None:  # fmt: skip
+    """Add and subtract the squares of differences whose missing samples are missing on all axes.
+
+    The weights of eight differences are computed at a time, and those of the remaining differences one by one.
+    """
+    total, error = load_vector(sums, own), load_vector(rest, own)
+    counts, extras, count, extra = 0.0 * total, 0.0 * total, 0.0, 0.0
+    size, most, step, end = float(m), float(m - min_present(m)), np.uintp(LANES), np.uintp(rows)
+    v0, u1, v1 = step, step + step, step + step + step  # places of the weights in ``scratch``
+    for begin in range(np.uintp(0), end, step):
+        n, k = min(step, end - begin), begin * step
+        if n == step:
+            u, v, counted, more = _vector_weights(*_missing_in_rows(phase, new, k), size, most)
+            store_vector(scratch, 0, u)
+            store_vector(scratch, v0, v)
+            counts, extras = counts + counted, extras + more
+            u, v, counted, more = _vector_weights(*_missing_in_rows(phase, gone, k), size, most)
+            store_vector(scratch, u1, u)
+            store_vector(scratch, v1, v)
+            counts, extras = counts - counted, extras - more
+        else:
+            for j in range(n):
+                own_k = k + j * step
+                scratch[j], scratch[v0 + j], added, more = _weights(*_missing_in_row(phase, new, own_k), size, most)
+                scratch[u1 + j], scratch[v1 + j], evicted, less = _weights(
+                    *_missing_in_row(phase, gone, own_k), size, most
+                )
+                count += added - evicted
+                extra += more - less
+        for j in range(n):
+            own_k = k + j * step
+            d = _weighted_difference(phase, new, own_k, broadcast(scratch[j]), broadcast(scratch[v0 + j]))
+            e = _weighted_difference(phase, gone, own_k, broadcast(scratch[u1 + j]), broadcast(scratch[v1 + j]))
+            total, error = _exchange_squares(total, error, d * d, e * e)
+    store_vector(sums, own, total)
+    store_vector(rest, own, error)
+    change, change_of_excess = np.int64(sum_vector(counts) + count), np.int64(sum_vector(extras) + extra)
+    for lane in range(own, own + AXES):
+        terms[lane] += change
+        excess[lane] += change_of_excess
+
+
+@inlined
+def _exchange_partial(
+    phase: Ints, missing: NDArray[np.int32], new: Offsets, gone: Offsets, rows: int, m: int,
+    sums: Floats, rest: Floats, terms: Ints, excess: Ints, own: int,
+) -> None:  # fmt: skip
+    """Add and subtract the squares of differences if each axis has missing samples of its own."""
+    total, error = load_vector(sums, own), load_vector(rest, own)
+    counts, extras = 0.0 * total, 0.0 * total
+    size, most = float(m), float(m - min_present(m))
+    for row in range(np.uintp(rows)):
+        k = row * np.uintp(LANES)
+        u, v, added, more = _vector_weights(*_missing_on_axes(missing, new, k), size, most)
+        d = _weighted_difference(phase, new, k, u, v)
+        u, v, evicted, less = _vector_weights(*_missing_on_axes(missing, gone, k), size, most)
+        e = _weighted_difference(phase, gone, k, u, v)
+        total, error = _exchange_squares(total, error, d * d, e * e)
+        counts, extras = counts + (added - evicted), extras + (more - less)
+    store_vector(sums, own, total)
+    store_vector(rest, own, error)
+    store_vector(terms, own, load_vector(terms, own) + to_integers(counts))
+    store_vector(excess, own, load_vector(excess, own) + to_integers(extras))
+
+
+@inlined
+def _missing_in_rows(phase: Ints, at: Offsets, k: np.uintp) -> tuple[Floats, Floats]:
+    """Return the numbers of missing samples in the older and the newer clusters of eight differences."""
+    i = k + np.uintp(MISSING_ROWS)
+    x0, x1, x2 = load_column(phase, at[0] + i), load_column(phase, at[1] + i), load_column(phase, at[2] + i)
+    return to_floats(x1 - x2), to_floats(x0 - x1)
+
+
+@inlined
+def _missing_in_row(phase: Ints, at: Offsets, k: np.uintp) -> tuple[float, float]:
+    """Return the numbers of missing samples in the older and the newer cluster of a difference."""
+    i = k + np.uintp(MISSING_ROWS)
+    return float(phase[at[1] + i] - phase[at[2] + i]), float(phase[at[0] + i] - phase[at[1] + i])
+
+
+@inlined
+def _missing_on_axes(missing: NDArray[np.int32], at: Offsets, k: np.uintp) -> tuple[Floats, Floats]:
+    """Return the numbers of missing samples of each axis in the older and the newer clusters of a difference."""
+    c0, c1, c2 = load_vector(missing, at[0] + k), load_vector(missing, at[1] + k), load_vector(missing, at[2] + k)
+    return to_floats(c1 - c2), to_floats(c0 - c1)
+
+
+@inlined
+def _second_difference(phase: Ints, at: Offsets, k: np.uintp) -> Floats:
+    x1 = load_vector(phase, at[1] + k)
+    return to_floats(load_vector(phase, at[0] + k) - x1 - x1 + load_vector(phase, at[2] + k))
+
+
+@inlined
+def _weighted_difference(phase: Ints, at: Offsets, k: np.uintp, u: Floats, v: Floats) -> Floats:
+    """Return m times the differences of the means of the present samples, see ``weights_of_differences``."""
+    both = to_floats(load_vector(phase, at[0] + k) - load_vector(phase, at[2] + k))
+    return u * _second_difference(phase, at, k) + v * both
+
+
+@inlined
+def _exchange_squares(total: Floats, error: Floats, added: Floats, evicted: Floats) -> tuple[Floats, Floats]:
+    """Add squares to sums and subtract other squares, and add the rounding errors to ``error``.
+
+    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B.
+    """
+    t = total + added
+    z = t - total
+    first = (total - (t - z)) + (added - z)
+    u = t - evicted
+    z = u - t
+    return u, error + (first + ((t - (u - z)) - (evicted + z)))
 
 
 @inlined
 def missing_between(newer: np.int32, older: np.int32) -> int:
     """Return the difference of two elements of the running count of missing samples, which wraps around."""
     return int(np.int32(newer - older))
-
-
-@compiled
-def _replace_incomplete(
-    phase: Ints,
-    missing: NDArray[np.int32],
-    at0: int,
-    at1: int,
-    at2: int,
-    m: int,
-    rows: int,
-    step: int,
-    shared: bool,
-    squares: Floats,
-    terms: Ints,
-    excess: Ints,
-    own: int,
-) -> None:
-    """Replace the squares of differences with missing samples, and add the terms ``step`` times to the counts.
-
-    The squares, the counts and the sums of this τ begin at the index ``own``. The square is zero if too few samples of
-    a cluster are present. If ``shared`` is True, the same samples are missing on all axes.
-    """
-    most, lanes, together, begin = m - min_present(m), np.uintp(LANES), np.uintp(AXES if shared else 1), np.uintp(own)
-    for first in range(np.uintp(0), np.uintp(AXES), together):
-        newest, oldest = np.uintp(at0 + rows - 1) * lanes + first, np.uintp(at2) * lanes + first
-        if missing[newest] == missing[oldest]:  # all differences are complete
-            for lane in range(begin + first, begin + first + together):
-                terms[lane] += step * rows
-            continue
-        older, newer, extra, counted, added = 0, 0, 0, 0, 0
-        share_a = share_b = 1.0 / m
-        for row in range(rows):
-            i0, i1 = np.uintp(at0 + row) * lanes + first, np.uintp(at1 + row) * lanes + first
-            i2, out = np.uintp(at2 + row) * lanes + first, begin + np.uintp(row) * lanes + first
-            a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
-            if a > most or b > most:
-                for lane in range(together):
-                    squares[out + lane] = 0.0
-                continue
-            counted += 1
-            if a == 0 and b == 0:
-                continue
-            if a != older or b != newer:
-                older, newer, share_a, share_b = a, b, 1.0 / (m - a), 1.0 / (m - b)
-                extra = _excess_of_term(a, b, share_a, share_b)
-            added += extra
-            for lane in range(together):
-                x0, x1, x2 = phase[i0 + lane], phase[i1 + lane], phase[i2 + lane]
-                d = _scaled_difference(x0, x1, x2, m, m - a, m - b, share_a, share_b)
-                squares[out + lane] = d * d
-        for lane in range(begin + first, begin + first + together):
-            terms[lane] += step * counted
-            excess[lane] += step * added
-
-
-@inlined
-def _scaled_difference(
-    phase0: int, phase1: int, phase2: int, m: int, older: int, newer: int, older_share: float, newer_share: float
-) -> float:
-    """Return m times the difference of the means of the present samples in two clusters, in integer units."""
-    if older == newer:
-        return float(phase0 - 2 * phase1 + phase2) * (m * older_share)
-    return m * difference_of_means(phase1 - phase2, phase0 - phase1, older, newer, older_share, newer_share)
-
-
-@inlined
-def _excess_of_term(missing_older: int, missing_newer: int, older_share: float, newer_share: float) -> int:
-    """Return m/n_A + m/n_B − 2 in ``EXCESS_UNIT``."""
-    return int(np.int64(np.rint((missing_older * older_share + missing_newer * newer_share) / EXCESS_UNIT)))
 
 
 @inlined
@@ -390,64 +479,6 @@ def difference_of_means(
     """
     level = np.int64(np.rint(older_sum * older_share))
     return float(newer_sum - level * newer) * newer_share - float(older_sum - level * older) * older_share
-
-
-@compiled
-def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
-    """Add the squares ``added`` to the sums, and subtract the squares ``evicted`` from the sums.
-
-    The rounding errors are accumulated in ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). The indices are
-    unsigned and ``lanes`` is an argument, because the compiler would otherwise not vectorize the inner loop.
-    """
-    for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
-        for lane in range(np.uintp(lanes)):
-            s = sums[lane]
-            t = s + added[row + lane]
-            z = t - s
-            first = (s - (t - z)) + (added[row + lane] - z)
-            u = t - evicted[row + lane]
-            z = u - t
-            sums[lane] = u
-            rest[lane] += first + ((t - (u - z)) - (evicted[row + lane] + z))
-
-
-@compiled
-def _replace_terms(
-    now: int,
-    whole: bool,
-    factors: Ints,
-    spans: Ints,
-    phase: Ints,
-    missing: NDArray[np.int32],
-    scratch: Floats,
-    terms: Ints,
-    excess: Ints,
-    sums: Floats,
-    rest: Floats,
-) -> None:
-    """Update the sums of all τ with a single new sample, for a full window without samples that only some axes lack.
-
-    A single loop over all averaging times is faster than an array operation for each averaging time.
-    """
-    places = phase.size // LANES
-    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
-    at0 = np.uintp(now * LANES)
-    for i in range(factors.size):
-        m, old, own = factors[i], now - spans[i] - 1, i * LANES
-        new1, new2 = ring_row(now - m, places), ring_row(now - 2 * m, places)
-        first, middle, last = ring_row(old + 2 * m, places), ring_row(old + m, places), ring_row(old, places)
-        at1, at2, out = np.uintp(new1 * LANES), np.uintp(new2 * LANES), np.uintp(own)
-        old0, old1, old2 = np.uintp(first * LANES), np.uintp(middle * LANES), np.uintp(last * LANES)
-        for lane in range(np.uintp(AXES)):
-            d = float(phase[at0 + lane] - 2 * phase[at1 + lane] + phase[at2 + lane])
-            e = float(phase[old0 + lane] - 2 * phase[old1 + lane] + phase[old2 + lane])
-            added[out + lane] = d * d
-            evicted[out + lane] = e * e
-        if not whole:
-            _replace_incomplete(phase, missing, now, new1, new2, m, 1, 1, True, added, terms, excess, own)
-            _replace_incomplete(phase, missing, first, middle, last, m, 1, -1, True, evicted, terms, excess, own)
-    n = factors.size * LANES
-    _exchange(added, evicted, n, sums, rest, n)
 
 
 @compiled
@@ -483,18 +514,14 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
         i0, i1 = ring_row(at, places) * LANES + axis, ring_row(at - m, places) * LANES + axis
         i2 = ring_row(at - 2 * m, places) * LANES + axis
         a, b = missing_between(missing[i1], missing[i2]), missing_between(missing[i0], missing[i1])
-        if a > most or b > most:
-            continue
-        d = float(phase[i0] - 2 * phase[i1] + phase[i2])
-        if a != 0 or b != 0:
-            share_a, share_b = 1.0 / (m - a), 1.0 / (m - b)
-            d = _scaled_difference(phase[i0], phase[i1], phase[i2], m, m - a, m - b, share_a, share_b)
-            excess += _excess_of_term(a, b, share_a, share_b)
+        u, v, counted, extra = _weights(float(a), float(b), float(m), float(most))
+        d = u * float(phase[i0] - 2 * phase[i1] + phase[i2]) + v * float(phase[i0] - phase[i2])
         s = total + d * d
         z = s - total
         left += (total - (s - z)) + (d * d - z)
         total = s
-        count += 1
+        count += int(counted)
+        excess += int(extra)
     w.sums[own], w.rest[own], w.terms[own], w.excess[own] = total, left, count, excess
 
 

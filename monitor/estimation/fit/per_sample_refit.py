@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined
+from monitor.common.compiled_vectors import LANES
 from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, CovarianceTable, CovarianceTablesByAxis
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
-    LANES,
     LAST_MISSING,
     MAX_ROUNDING_SQUARE,
     NEWEST,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import monitor.common.compiled
-from monitor.common.compiled import IMPORT_STATEMENT, Kernel, compiled, hash_module_with_imports, int_to_float
+from monitor.common.compiled import IMPORT_STATEMENT, Kernel, compiled, hash_module_with_imports
 from monitor.estimation.fit import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
@@ -163,18 +163,3 @@ def test_the_garbage_collector_runs_again_after_a_compilation():
 
     assert half(3.0) == 1.5
     assert gc.isenabled()
-
-
-@compiled
-def convert_to_floats(values, floats):
-    for i in range(values.size):
-        floats[i] = int_to_float(values[i])
-
-
-def test_integers_are_rounded_to_the_nearest_floats():
-    bits = np.random.default_rng(0).integers(-(1 << 63), (1 << 63) - 1, 10_000)
-    values = np.concatenate([bits >> shift for shift in range(64)] + [np.array([-(1 << 63), (1 << 63) - 1, 0])])
-    floats = np.empty(values.size)
-    convert_to_floats(values, floats)
-    assert np.array_equal(floats, values.astype(np.float64))
-    assert int_to_float((1 << 53) + 1) == 2.0**53

@@ -571,6 +571,17 @@ def test_restarted_axis_equals_the_batch_of_its_newest_samples(kept):
         check_against_batch(window, samples, kept=own)
 
 
+def test_axis_that_is_restarted_twice_has_no_cluster_across_both_restarts():
+    """The second restart keeps samples that the first restart has discarded."""
+    values = simulate_values(130)
+    window = AllanWindow(130, np.array([1, 20, 65]))
+    window.append_samples(values)
+    window.keep_newest(3, 65)
+    window.keep_newest(3, 90)
+    window.append_samples(values[:40])
+    check_against_batch(window, np.concatenate([values, values[:40]]), kept=np.array([130, 130, 130, 105, 130, 130]))
+
+
 def test_slope_of_a_restarted_axis_uses_its_own_samples():
     values = simulate_values(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
     window = AllanWindow(LENGTH, FACTORS)
@@ -688,9 +699,13 @@ def test_correction_of_each_grid_uses_the_same_grid():
     check_against_batch(sparse, values)
 
 
-def test_constant_axis_with_missing_samples_has_no_variance():
+@pytest.mark.parametrize("longest_burst", [1, 80])
+def test_constant_axis_with_missing_samples_has_no_variance(longest_burst):
     values = np.tile(np.array([0.3, -60.0, 1e-3, 9.81, -399.0, 0.0]), (1000, 1))
-    values[np.random.default_rng(8).random(1000) < 0.2] = np.nan
+    rng = np.random.default_rng(8)
+    for at in rng.choice(1000, 200 // longest_burst, replace=False):
+        values[at : at + longest_burst] = np.nan
     window = AllanWindow(500, np.array([1, 4, 16, 100, 250]))
     window.append_samples(values)
+    assert window.variances().terms[-1].all()
     assert not window.avar().any()
