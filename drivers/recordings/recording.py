@@ -157,12 +157,12 @@ def assemble_recording(path: Path, table: Table, rate_hz: float | None, options:
 
 
 def _stack_axes(columns: Columns, n: int) -> Floats:
-    """Return the axes as an array [n, 6]. An array that already consists of these columns is not copied."""
+    """Return the axes as an array [n, 6]. An array that already begins with these columns is not copied."""
     whole = columns[AXES[0]].base if AXES[0] in columns else None
-    if whole is not None and whole.shape == (n, len(AXES)):
-        parts = {axis: whole[:, i].__array_interface__ for i, axis in enumerate(AXES)}
+    if whole is not None and whole.shape[1:] == (len(AXES),) and len(whole) >= n:
+        parts = {axis: whole[:n, i].__array_interface__ for i, axis in enumerate(AXES)}
         if all(axis in columns and columns[axis].__array_interface__ == part for axis, part in parts.items()):
-            return whole
+            return whole[:n]
     values = np.full((n, len(AXES)), np.nan)
     for i, axis in enumerate(AXES):
         if axis in columns:

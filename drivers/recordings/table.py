@@ -1,7 +1,7 @@
 """Types and functions that all recording formats share."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -77,7 +77,24 @@ def column_dtype(name: str) -> np.dtype[Any]:
 
 def to_column(quantity: str, numbers: NDArray[Any]) -> Times:
     """Return numbers as float64, or integer times (``t``) as int64, because float64 would round Unix times."""
-    return integers_to_ns(numbers, 1) if quantity == "t" and numbers.dtype.kind in "iu" else numbers.astype(np.float64)
+    if quantity == "t" and numbers.dtype.kind in "iu":
+        return integers_to_ns(numbers, 1)
+    return numbers.astype(np.float64, copy=False)
+
+
+def collect_columns(columns: Iterable[tuple[str, Times]]) -> dict[str, Times]:
+    """Return columns by name. Axes become columns of one array [n, 6], which ``assemble_recording`` does not copy."""
+    found = dict[str, Times]()
+    values: Floats | None = None
+    for name, column in columns:
+        if name in AXES:
+            values = np.full((column.size, len(AXES)), np.nan) if values is None else values
+            if column.size == len(values):  # other lengths are reported later
+                place = values[:, AXES.index(name)]
+                place[:] = column
+                column = place
+        found[name] = column
+    return found
 
 
 def integers_to_ns(numbers: NDArray[Any], ns_per_unit: int) -> Ints:

@@ -155,21 +155,25 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
             converters[layout.columns[table.SENSOR]] = lambda field: sensors.setdefault(field.strip(' "'), len(sensors))
         use = list(layout.columns.values())
         dtype = np.dtype([(name, time_type if name == "t" else "f8") for name in layout.columns])
-        parts: list[Rows] = []
+        values = np.full((lines, len(AXES)), np.nan)  # one array, which ``assemble_recording`` does not copy
+        columns: dict[str, Any] = {
+            name: values[:, AXES.index(name)] if name in AXES else np.empty(lines, dtype[name])
+            for name in layout.columns
+        }
         read = 0
         for part in _parse_pieces(label, header, texts, use, dtype, bad, converters):
-            parts.append(part)
+            for name, column in columns.items():
+                column[read : read + len(part)] = part[name]
             read += len(part)
             report_read_share(read, lines)
-    rows = np.concatenate(parts) if parts else np.empty(0, dtype)
-    if 2 * bad.count > len(rows):
-        raise _too_many_bad_lines(label, bad, len(rows))
+    if 2 * bad.count > read:
+        raise _too_many_bad_lines(label, bad, read)
     if bad.count:
-        notes.append(f"{bad.count} of {len(rows)} lines are not samples and are read as missing ({bad.first}).")
-    if not len(rows):
+        notes.append(f"{bad.count} of {read} lines are not samples and are read as missing ({bad.first}).")
+    if not read:
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{label}: has a header line but no complete line of samples after it{what}")
-    columns = {name: rows[name] for name in layout.columns}
+    columns = {name: column[:read] for name, column in columns.items()}
     if text_time and not has_date(text_time):
         columns["t"] = table.unwrap_times(columns["t"], DAY_NS)
     rate_hz = None if "t" in columns else header.stated_rate_hz

@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -100,14 +101,12 @@ def read_npz(path: Path, options: ReadingOptions) -> table.Table:
                 layout = find_layout(path, list(keys), options, notes, read_column=read_column)
                 used = {quantity: pairs[i] for quantity, i in layout.columns.items()}
                 _check_columns(path, archive, [key for _, key in used.values()])
-                arrays = {
-                    key: _read_array(path, archive, key) for key in dict.fromkeys(key for _, key in used.values())
-                }
+                read_newest = lru_cache(1)(partial(_read_array, path, archive))  # a matrix has several columns
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
-                    columns = {
-                        quantity: table.to_column(quantity, _take_column(arrays[key], name, key))
+                    columns = table.collect_columns(
+                        (quantity, table.to_column(quantity, _take_column(read_newest(key), name, key)))
                         for quantity, (name, key) in used.items()
-                    }
+                    )
                 return table.Table(columns, _read_fs(path, archive, notes), notes, layout.units, layout.names)
     arrays, cut = _recover_arrays(path, options)
     if not arrays:
