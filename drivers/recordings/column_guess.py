@@ -34,10 +34,13 @@ ReadColumn = Callable[[int], Sequence[Any] | NDArray[Any]]
 """Function that returns the first values of a column. Text is not converted to numbers."""
 
 
-def guess_columns(numbers: Floats) -> dict[str, int]:
-    """Return the index of the column of each quantity that the numbers [rows, columns] may contain. NaN means text."""
+def guess_columns(numbers: Floats) -> tuple[dict[str, int], list[int]]:
+    """Return the index of the column of each quantity that the numbers [rows, columns] may contain. NaN means text.
+
+    A list of the first columns of other vectors follows that may be an accelerometer as well.
+    """
     if len(numbers) < MIN_ROWS:
-        return {}
+        return {}, []
     numbers = np.where(np.abs(numbers) < MAX_NUMBER, numbers, np.nan)
     steps = np.diff(numbers, axis=0)
     typical = np.median(steps, axis=0)
@@ -55,7 +58,11 @@ def guess_columns(numbers: Floats) -> dict[str, int]:
     for start, axes in ((gyro, AXES[:3]), (accel, AXES[3:])):
         if start is not None:
             found |= {axis: start + i for i, axis in enumerate(axes)}
-    return found
+    others: list[int] = []
+    for start in sorted(accels):
+        if all(abs(start - taken) >= 3 for taken in (*others, accel, gyro) if taken is not None):
+            others.append(start)
+    return found, others
 
 
 def _gravity_distance(length: float) -> float:
@@ -90,17 +97,21 @@ def create_unknown_columns_error(
     columns = [read_column(i) for i in range(min(len(names), MAX_LISTED_COLUMNS))]
     rows = max((len(column) for column in columns), default=0)
     numbers = [_to_numbers(column, rows) for column in columns]
-    guess = guess_columns(np.column_stack(numbers)) if numbers else {}
+    guess, others = guess_columns(np.column_stack(numbers)) if numbers else ({}, [])
     guess = {quantity: i for quantity, i in guess.items() if quantity not in known}
     options = ",".join(f"{quantity}={i + 1}" for quantity, i in guess.items()) or shlex.quote(f"gx={example}")
     rate = "" if "t" in (*guess, *known) or "fs" in names else " --rate HZ"
-    quantities = {i: quantity for quantity, i in (*guess.items(), *known.items())}
+    quantities = {start + i: f"{axis}?" for start in others for i, axis in enumerate(AXES[3:])}
+    quantities |= {i: quantity for quantity, i in (*guess.items(), *known.items())}
     lines = [f"{'column':6}  {'guess':5}  {'name':24}  first values"]
     for i, column in enumerate(columns):
         values = " ".join(_format_value(value) for value in column[:SHOWN_VALUES])
         lines.append(f"{i + 1:<6}  {quantities.get(i, ''):5}  {names[i][:24]:24}  {values}")
     if len(names) > len(columns):
         lines.append(f"{len(names) - len(columns)} more columns")
+    if others:
+        listed = ", ".join(f"{start + 1} to {start + 3}" for start in others)
+        lines.append(f"Columns {listed} may be the accelerometer as well: choose one.")
     command = f"imu-monitor analyze {shlex.quote(str(path))} --columns {options}{rate}"
     return UnknownColumnsError(f"{text}, such as {command}", lines)
 

@@ -87,8 +87,11 @@ def test_unknown_columns_are_listed_with_a_command_that_can_be_copied(tmp_path: 
     with pytest.raises(UnknownColumnsError) as error:
         read(path, {})
     lines = error.value.column_lines
-    assert len(lines) == 1 + 54
-    assert lines[5].split() == ["5", "column", "5", *lines[5].split()[3:]]
+    assert len(lines) == 1 + 54 + 1
+    assert [line.split()[1] for line in lines[5:8]] == ["ax?", "ay?", "az?"]
+    assert lines[-1].startswith("Columns 5 to 7, 22 to 24, ")
+    assert lines[-1].endswith(" may be the accelerometer as well: choose one.")
+    assert lines[4].split()[:3] == ["4", "column", "4"]
     assert [line.split()[1] for line in lines[11:14]] == ["gx", "gy", "gz"]
     command = str(error.value).partition("such as ")[2].partition("such as ")[2]
     assert shlex.split(command)[:3] == ["imu-monitor", "analyze", str(path)]
