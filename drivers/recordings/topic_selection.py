@@ -25,6 +25,8 @@ BLOCK_ROWS: Final = 4096
 """Number of rows that are converted to arrays at once. As Python objects, a row needs about 400 bytes."""
 MAX_RATE_DIFFERENCE: Final = 0.1
 """Largest relative difference of the mean rates of two topics that are joined. Lost messages reduce a mean rate."""
+MIN_STATED_DELAY: Final = 0.02
+"""Smallest delay between joined samples that is stated, as a fraction of the sampling interval."""
 MIN_COMMON_SHARE: Final = 0.5
 """Smallest share of the rows that a joined topic needs to contain."""
 HOW_TO_CHOOSE: Final = "choose with --topic (in a configuration file: topic)"
@@ -120,7 +122,7 @@ def pair_triads(gyros: Sequence[str], accels: Sequence[str], sensor: Callable[[s
     return [f"{gyro}{JOIN}{accel}" for gyro in gyros for accel in accels if sensor(gyro) == sensor(accel)]
 
 
-def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
+def join_topics(path: Path, tables: Mapping[str, Columns], notes: list[str]) -> dict[str, Times]:
     """Join the columns of several topics.
 
     The first topic determines the rows. The gyroscope comes from the first topic that contains one, and the
@@ -133,6 +135,8 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
         Path of the file, used in error messages.
     tables
         Columns of each topic, which include ``t`` or ``t_ns``. The first topic contains at least one axis.
+    notes
+        A note is appended if samples of two topics that are joined have different times.
 
     Raises
     ------
@@ -152,6 +156,12 @@ def join_topics(path: Path, tables: Mapping[str, Columns]) -> dict[str, Times]:
                 raise ConfigError(
                     f"{path}: only {common} of {t_s.size} samples of {first} have a sample of {name} at the same time; "
                     f"{_suggest_two_analyses(path, (first, name))}"
+                )
+            delay_s = float(np.median((other_s[rows] - t_s)[rows >= 0]))
+            if abs(delay_s) > MIN_STATED_DELAY * (t_s[-1] - t_s[0]) / t_s.size:
+                notes.append(
+                    f"Samples of {name} have the times of {first}, although they are {abs(delay_s) * 1e3:.3g} ms "
+                    f"{'later' if delay_s > 0.0 else 'earlier'}; --topic {quote(name)} reads them with their own times."
                 )
         else:
             rows = _preceding_rows(t_s, other_s)

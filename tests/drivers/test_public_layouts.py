@@ -97,6 +97,12 @@ def test_unknown_columns_are_listed_with_a_command_that_can_be_copied(tmp_path: 
     assert shlex.split(command)[:3] == ["imu-monitor", "analyze", str(path)]
 
 
+def test_delay_between_joined_sensors_is_stated(tmp_path: Path) -> None:
+    layout = next(one for one in LAYOUTS if one.name == "GnssLogger")
+    notes = read(layout.write(simulate_sensor(layout.rate_hz), tmp_path), {}).notes
+    assert any("of UncalAccel have the times of UncalGyro, although they are 1 ms later" in note for note in notes)
+
+
 SENSOR = simulate_sensor(100.0)
 AXIS_NAMES = "gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
 COUNTER = np.arange(len(SENSOR.t))

@@ -96,7 +96,7 @@ def read_ardupilot_log(path: Path, topic: str | None) -> table.Table:
         tables = {name: _read_columns(log, messages[name]) for name in names}
         if (end := _end_of_messages(log)) < log.data_len - MAX_TRAILING_BYTES:
             notes.append(f"The log is damaged at byte {end} of {log.data_len} and was read up to there.")
-    return table.Table(join_topics(path, tables), None, notes)
+    return table.Table(join_topics(path, tables, notes), None, notes)
 
 
 @contextmanager

@@ -77,7 +77,7 @@ def read_sensor_files(path: Path, options: ReadingOptions) -> table.Table:
             tables[name] = found.columns
             stated |= found.units
             notes += [f"{name}: {note}" for note in found.notes]
-    return table.Table(join_topics(path, tables), None, notes, stated)
+    return table.Table(join_topics(path, tables, notes), None, notes, stated)
 
 
 def _select(

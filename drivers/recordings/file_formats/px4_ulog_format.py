@@ -60,7 +60,7 @@ def read_ulog(path: Path, topic: str | None) -> table.Table:
         lost_ms = sum(one.duration for one in log.dropouts)
         notes.append(f"The logger lost messages {len(log.dropouts)} times, for {lost_ms / 1e3:g} s in total.")
     tables = {name: read_columns(data[name].name, data[name].data) for name in names}
-    return table.Table(join_topics(path, tables), None, notes)
+    return table.Table(join_topics(path, tables, notes), None, notes)
 
 
 def _load(path: Path, limit: memory_check.RecordingSizeLimits) -> Any:

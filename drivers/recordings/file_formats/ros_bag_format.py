@@ -92,7 +92,7 @@ def read_ros_bag(path: Path, topic: str | None) -> table.Table:
         names = bag.select(path, topic, notes)
         limit.check_row_count(sum(one.rows for one in bag.topics if one.name in names))
         tables: dict[str, table.Columns] = {name: _read_topic(bag, name, limit, notes) for name in names}
-    return table.Table(join_topics(path, tables), None, notes)
+    return table.Table(join_topics(path, tables, notes), None, notes)
 
 
 @dataclass(frozen=True, slots=True)
