@@ -195,9 +195,10 @@ def _select_named_sensor(
     }
     sensors = sorted({one.sensor for one in axes.values()} - {""})
     topic = options.topic
-    if topic in sensors:
-        measured = {one.quantity for one in axes.values() if one.sensor == topic}
-        others = {i for i, one in axes.items() if one.sensor != topic and (one.sensor or one.quantity in measured)}
+    chosen = next((one for one in sensors if topic is not None and one.lower() == topic.lower()), None)
+    if chosen is not None:
+        measured = {one.quantity for one in axes.values() if one.sensor == chosen}
+        others = {i for i, one in axes.items() if one.sensor != chosen and (one.sensor or one.quantity in measured)}
         return {i: one for i, one in meanings.items() if i not in others}
     if topic is not None and not has_sensor_column:
         if sensors:

@@ -103,6 +103,12 @@ def test_delay_between_joined_sensors_is_stated(tmp_path: Path) -> None:
     assert any("of UncalAccel have the times of UncalGyro, although they are 1 ms later" in note for note in notes)
 
 
+def test_sensor_is_chosen_as_it_is_written_in_the_column_names(tmp_path: Path) -> None:
+    layout = next(one for one in LAYOUTS if one.name == "Shimmer Consensys")
+    sensor = simulate_sensor(layout.rate_hz)
+    require_samples(read(layout.write(sensor, tmp_path), {"topic": "LN"}), layout, sensor)
+
+
 SENSOR = simulate_sensor(100.0)
 AXIS_NAMES = "gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"
 COUNTER = np.arange(len(SENSOR.t))
