@@ -3,7 +3,7 @@
 import contextlib
 import tracemalloc
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,8 @@ from drivers.decoders.messages import samples
 from drivers.errors import ConfigError, ImuError, LinkEnded
 from drivers.links import replay_link
 from drivers.recordings import Recording, load_samples, save_samples
-from drivers.recordings.reading_options import create_reading_options, parse_column_mapping
+from drivers.recordings.file_formats.csv_format import CsvSource, read_csv_source
+from drivers.recordings.reading_options import DEFAULT_OPTIONS, create_reading_options, parse_column_mapping
 from drivers.recordings.table_layout import parse_column_name
 from drivers.units import DEGREE, G0
 from drivers.validation.settings_model import check_table
@@ -403,6 +404,22 @@ def test_memory_does_not_grow_with_the_text(tmp_path: Path) -> None:
     rows = 20 * N
     assert path.stat().st_size > 9e6
     assert peak < 4 * 8 * 8 * rows + 6e6  # copies of the samples, and pieces of 1 MiB
+
+
+def test_rows_that_a_logger_appends_meanwhile_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    rows = lines("t,gx", np.arange(N) / 100.0, noise()[:, 0])
+    path.write_text(rows)
+
+    def open_and_append() -> IO[bytes]:
+        opened = path.open("rb")
+        with path.open("a") as file:
+            file.write(rows.partition("\n")[2])
+        return opened
+
+    found = read_csv_source(CsvSource(path, str(path), "", open_and_append), DEFAULT_OPTIONS)
+    np.testing.assert_allclose(found.columns["gx"][:N], noise()[:, 0])
+    assert N <= found.columns["gx"].size <= 2 * N + 1
 
 
 def test_own_header_is_unchanged(tmp_path: Path) -> None:

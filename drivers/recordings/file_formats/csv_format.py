@@ -162,9 +162,10 @@ def _read_columns(source: CsvSource, options: ReadingOptions, time_type: str, li
         }
         read = 0
         for part in _parse_pieces(label, header, texts, use, dtype, bad, converters):
+            kept = part[: lines - read]  # a logger may have appended rows since the lines were counted
             for name, column in columns.items():
-                column[read : read + len(part)] = part[name]
-            read += len(part)
+                column[read : read + len(kept)] = kept[name]
+            read += len(kept)
             report_read_share(read, lines)
     if 2 * bad.count > read:
         raise _too_many_bad_lines(label, bad, read)
