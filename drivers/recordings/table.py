@@ -197,7 +197,8 @@ NO_RECORDINGS: Final = (
 
 def describe_no_recording(path: Path) -> str:
     """Return an error text about a file that contains no samples, with a remedy, or an empty text."""
-    return next((f"; its content is {what}" for pattern, what in NO_RECORDINGS if pattern.match(_read_start(path))), "")
+    start = _read_start(path)
+    return next((f"; its content is {what}" for pattern, what in NO_RECORDINGS if pattern.match(start)), "")
 
 
 def _read_start(path: Path) -> bytes:
